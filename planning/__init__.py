@@ -1,0 +1,48 @@
+"""Trajectories for robots covered by spheres, through any signed distance field.
+
+The closed-loop base tracker needs casadi and is imported on its own: `from planning.tracking import BaseTracker`.
+"""
+
+from planning.chomp import Chomp, ChompConfig
+from planning.errors import ConfigError, FieldError, PlanningError, SolverError, TrajectoryError
+from planning.metric import MetricConfig
+from planning.objective import ObjectiveConfig
+from planning.protocols import (
+    ConfidentField,
+    CostField,
+    DistanceField,
+    FloorRobot,
+    LinkedRobot,
+    SelfCollidingRobot,
+    SphereRobot,
+)
+from planning.result import PlanResult, Status
+from planning.trajectory import Trajectory
+from planning.validation import Validation, ValidationConfig, check
+from planning.workspace import WorkspaceConfig
+
+__all__ = [
+    "Chomp",
+    "ChompConfig",
+    "ConfidentField",
+    "ConfigError",
+    "CostField",
+    "DistanceField",
+    "FieldError",
+    "FloorRobot",
+    "LinkedRobot",
+    "MetricConfig",
+    "ObjectiveConfig",
+    "PlanResult",
+    "PlanningError",
+    "SelfCollidingRobot",
+    "SolverError",
+    "SphereRobot",
+    "Status",
+    "Trajectory",
+    "TrajectoryError",
+    "Validation",
+    "ValidationConfig",
+    "WorkspaceConfig",
+    "check",
+]

@@ -1,0 +1,78 @@
+"""Pure functions of the CHOMP cost: c(d), the obstacle functional by arc length, self-collision."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def hinge_cost(
+    distance: Float[Tensor, "*batch"], eps: float
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Cost c(d) of a clearance d [m] and its derivative (CHOMP, equation 21).
+
+    c = eps/2 - d inside (d < 0), (d - eps)^2 / (2 eps) up to eps, 0 beyond. NaN stays NaN.
+    """
+    shortfall = (eps - distance).clamp_min(0.0)
+    inside = distance < 0
+    cost = torch.where(inside, 0.5 * eps - distance, shortfall.square() / (2 * eps))
+    slope = torch.where(inside, -torch.ones_like(distance), -shortfall / eps)
+    return cost, slope
+
+
+def arc_length_cost(
+    points: Float[Tensor, "n s 3"],
+    cost: Float[Tensor, "n s"],
+    cost_gradient: Float[Tensor, "n s 3"],
+    guard: float = 1e-3,
+) -> tuple[Float[Tensor, ""], Float[Tensor, "n s 3"]]:
+    """Obstacle functional of the paths of s spheres and its exact gradient (CHOMP, equations 18 and 23).
+
+    U = sum over segments of (c_i + c_{i+1}) / 2 * l_i, the trapezoid rule of the integral of c |x'| dt, with
+    l = sqrt(|dx|^2 + guard^2), so that a sphere at rest keeps a cost and no division by zero occurs. The
+    gradient is that of this sum. It needs no explicit curvature: as the waypoints grow denser it tends to
+    |x'| [(I - x' x'^T) grad c - c kappa], of which it is the form before integration by parts.
+
+    Args:
+        points: positions x of the spheres at n waypoints [m].
+        cost: c there [m].
+        cost_gradient: grad c there.
+        guard: [m].
+
+    Returns:
+        U summed over spheres [m^2], and dU/dx (n, s, 3).
+    """
+    steps = points.diff(dim=0)
+    lengths = (steps.square().sum(-1) + guard**2).sqrt()
+    means = 0.5 * (cost[:-1] + cost[1:])
+    pull = (means / lengths).unsqueeze(-1) * steps  # mean cost times the unit tangent
+    half = 0.5 * lengths.unsqueeze(-1)
+    gradient = torch.zeros_like(points)
+    gradient[:-1] += half * cost_gradient[:-1] - pull
+    gradient[1:] += half * cost_gradient[1:] + pull
+    return (means * lengths).sum(), gradient
+
+
+def self_collision_cost(
+    centres: Float[Tensor, "n s 3"],
+    radii: Float[Tensor, "s"],
+    pairs: Int[Tensor, "p 2"],
+    eps: float,
+) -> tuple[Float[Tensor, ""], Float[Tensor, "n s 3"], Float[Tensor, "n"]]:
+    """Sum over waypoints and pairs of c(gap between two spheres), averaged over the waypoints.
+
+    Returns:
+        The cost [m], its gradient with respect to the centres, and the smallest gap [m] at each waypoint.
+    """
+    first, second = pairs[:, 0], pairs[:, 1]
+    offset = centres[:, first] - centres[:, second]
+    separation = offset.norm(dim=-1).clamp_min(1e-9)
+    gap = separation - (radii[first] + radii[second])
+    cost, slope = hinge_cost(gap, eps)
+    n = len(centres)
+    push = (slope / (separation * n)).unsqueeze(-1) * offset
+    gradient = torch.zeros_like(centres)
+    gradient.index_add_(1, first, push)
+    gradient.index_add_(1, second, -push)
+    return cost.sum() / n, gradient, gap.amin(dim=1)

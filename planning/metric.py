@@ -1,0 +1,86 @@
+"""The metric A of covariant gradient descent: what makes two trajectories near each other (CHOMP, section 3.3)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from planning.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class MetricConfig:
+    """Weights of the squared derivatives that make up the smoothness and the metric.
+
+    Time runs from 0 to 1 along the trajectory, so the weights do not depend on the number of waypoints.
+
+    Args:
+        velocity: weight of the squared velocity. On its own it gives the shortest way out of an obstacle.
+        acceleration: weight of the squared acceleration; it rounds corners. The default makes bends of about a
+            seventh of the trajectory cost as much as their length does.
+        jerk: weight of the squared jerk.
+        ridge: relative to the largest diagonal entry, added to the diagonal of A for the update only.
+    """
+
+    velocity: float = 1.0
+    acceleration: float = 0.02
+    jerk: float = 0.0
+    ridge: float = 1e-6
+
+    def __post_init__(self) -> None:
+        weights = (self.velocity, self.acceleration, self.jerk)
+        if min(weights) < 0 or max(weights) == 0 or self.ridge < 0:
+            raise ConfigError(
+                f"MetricConfig: weights must not be negative and one must be positive, got velocity={self.velocity:g}, "
+                f"acceleration={self.acceleration:g}, jerk={self.jerk:g}, ridge={self.ridge:g}."
+            )
+
+
+class Metric:
+    """Smoothness F(q) = 1/2 sum_d w_d |K_d q|^2 of n waypoints and its metric A = sum_d w_d K_d^T K_d + ridge.
+
+    K_d are finite differences of order d; before the first and after the last waypoint the robot rests. The
+    first and last waypoint are fixed, so A is over the n - 2 interior ones. The whole is scaled so that a unit
+    push on the waypoint that gives way most moves it by one unit, whichever derivatives are weighted
+    (CHOMP, equations 10-17). Matrices are kept in float64 (A is ill-conditioned), arguments keep their type.
+    """
+
+    def __init__(self, num_waypoints: int, config: MetricConfig | None = None) -> None:
+        if num_waypoints < 3:
+            raise ConfigError(f"Metric: at least 3 waypoints are needed, got {num_waypoints}; resample first.")
+        config = config or MetricConfig()
+        step = 1.0 / (num_waypoints - 1)
+        full = torch.zeros(num_waypoints, num_waypoints, dtype=torch.float64)
+        for order, weight in enumerate((config.velocity, config.acceleration, config.jerk), start=1):
+            if weight > 0:
+                difference = _difference_matrix(num_waypoints, order) / step**order
+                full += weight * step * difference.T @ difference
+        interior = full[1:-1, 1:-1]
+        ridge = config.ridge * interior.diagonal().max() * torch.eye(num_waypoints - 2, dtype=torch.float64)
+        response = torch.linalg.inv(interior + ridge).diagonal().max()  # makes the largest entry of A^-1 one
+        self._full = full * response
+        self._factor = torch.linalg.cholesky((interior + ridge) * response)
+
+    def smoothness(self, q: Float[Tensor, "n dof"]) -> tuple[float, Float[Tensor, "n_interior dof"]]:
+        """F(q) and its gradient with respect to the interior waypoints."""
+        product = self._full @ q.double()
+        return 0.5 * float((product * q).sum()), product[1:-1].to(q)
+
+    def solve(self, gradient: Float[Tensor, "n_interior k"]) -> Float[Tensor, "n_interior k"]:
+        """A^-1 times a gradient over the interior waypoints."""
+        return torch.cholesky_solve(gradient.double(), self._factor).to(gradient)
+
+
+def _difference_matrix(num_waypoints: int, order: int) -> Float[Tensor, "rows n"]:
+    """Finite differences of one order, the ends repeated outwards (at rest before and after)."""
+    padding = order - 1
+    padded = torch.eye(num_waypoints, dtype=torch.float64)
+    padded = torch.cat([padded[:1].expand(padding, -1), padded, padded[-1:].expand(padding, -1)])
+    for _ in range(order):
+        padded = padded.diff(dim=0)
+    assert math.isclose(float(padded.sum(dim=1).abs().max()), 0.0, abs_tol=1e-9)  # a constant has no derivative
+    return padded

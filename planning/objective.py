@@ -1,0 +1,117 @@
+"""The CHOMP objective of a whole trajectory: smoothness, obstacles and self-collision, with its gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from planning.costs import arc_length_cost, hinge_cost, self_collision_cost
+from planning.errors import ConfigError
+from planning.metric import Metric
+from planning.protocols import SelfCollidingRobot, SphereRobot
+from planning.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """Weights of the objective U = smoothness_weight F + obstacle_weight U_obs + self_collision_weight U_self.
+
+    Args:
+        smoothness_weight: small, since free paths matter more than short ones.
+        obstacle_weight: of the arc-length functional, summed over spheres.
+        self_collision_weight: of the cost of gaps between links, averaged over the waypoints.
+        self_collision_eps: gap [m] between links at which their cost starts.
+        margin: clearance [m] from which a waypoint counts as free while optimising. A little more than the
+            check demands, since the check also looks between the waypoints.
+    """
+
+    smoothness_weight: float = 0.05
+    obstacle_weight: float = 1.0
+    self_collision_weight: float = 2.0
+    self_collision_eps: float = 0.03
+    margin: float = 0.005
+
+    def __post_init__(self) -> None:
+        weights = (self.smoothness_weight, self.obstacle_weight, self.self_collision_weight)
+        if min(weights) < 0 or self.self_collision_eps <= 0:
+            raise ConfigError(
+                f"ObjectiveConfig: weights must not be negative and self_collision_eps must be positive, got {self}."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The objective at one trajectory.
+
+    Args:
+        total: the weighted sum.
+        gradient: of the total over the interior waypoints.
+        free: whether every state looked at keeps clear of obstacles and of itself.
+    """
+
+    total: float
+    gradient: Float[Tensor, "n_interior dof"]
+    free: bool
+
+
+class Objective:
+    """Evaluates trajectories of n waypoints; looks at `substeps` states a segment.
+
+    The gradient is exact for the discrete objective: spheres are pulled back to the joints by one
+    vector-Jacobian product through `robot.spheres`, and states within a segment to its two waypoints.
+    """
+
+    def __init__(
+        self, robot: SphereRobot, workspace: Workspace, metric: Metric, config: ObjectiveConfig, substeps: int = 1
+    ) -> None:
+        self.robot, self.workspace, self.metric, self.config = robot, workspace, metric, config
+        self.substeps = substeps
+        pairs = robot.self_collision_pairs if isinstance(robot, SelfCollidingRobot) else None
+        self._pairs = pairs if pairs is not None and len(pairs) else None
+        margin = torch.tensor(config.margin, dtype=torch.float64)
+        self._free_cost = float(hinge_cost(margin, workspace.eps)[0]) + 1e-7
+
+    def __call__(self, q: Float[Tensor, "n dof"]) -> Evaluation:
+        """Evaluate waypoints q [rad | m], the first and last of which are fixed."""
+        spread = _interpolation_matrix(len(q), self.substeps).to(q)
+        states = (spread @ q).requires_grad_()
+        with torch.enable_grad():
+            centres, radii = self.robot.spheres(states)
+        x = centres.detach()
+        cost, cost_gradient = self.workspace.cost_and_gradient(x, radii)
+        obstacles, pull = arc_length_cost(x, cost, cost_gradient)
+        obstacles, pull = self.config.obstacle_weight * obstacles, self.config.obstacle_weight * pull
+        free = bool((cost <= self._free_cost).all())
+        if self._pairs is not None:
+            touch, push, gap = self_collision_cost(x, radii, self._pairs, self.config.self_collision_eps)
+            obstacles = obstacles + self.config.self_collision_weight * touch
+            pull = pull + self.config.self_collision_weight * push
+            free = free and bool((gap >= 0).all())
+        (state_gradient,) = torch.autograd.grad(centres, states, pull)
+        smoothness, smoothness_gradient = self.metric.smoothness(q)
+        weight = self.config.smoothness_weight
+        gradient = weight * smoothness_gradient + (spread.T @ state_gradient)[1:-1]
+        return Evaluation(weight * smoothness + float(obstacles), gradient, free)
+
+    def tightened(self, waypoints_free: bool) -> Objective:
+        """The objective for a trajectory that converged in collision.
+
+        If its waypoints collide, smoothness counts four times less; if only the motion between them does, twice as
+        many states a segment are looked at.
+        """
+        config, substeps = self.config, self.substeps
+        if waypoints_free:
+            substeps = 2 * substeps
+        else:
+            config = replace(config, smoothness_weight=config.smoothness_weight / 4)
+        return Objective(self.robot, self.workspace, self.metric, config, substeps)
+
+
+def _interpolation_matrix(num_waypoints: int, substeps: int) -> Float[Tensor, "m n"]:
+    """Linear interpolation from waypoints to `substeps` states a segment and the last waypoint."""
+    position = torch.arange((num_waypoints - 1) * substeps + 1, dtype=torch.float64) / substeps
+    waypoints = torch.arange(num_waypoints, dtype=torch.float64)
+    return (1 - (position[:, None] - waypoints).abs()).clamp_min(0)

@@ -1,0 +1,136 @@
+"""Distances and costs of a robot's spheres in a field, with the rules for the floor and for unknown space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from planning.costs import hinge_cost
+from planning.errors import ConfigError, FieldError
+from planning.protocols import ConfidentField, CostField, DistanceField, FloorRobot, SphereRobot
+
+MIN_FLOOR_SLOPE = 0.5  # upward component of a field's gradient where the floor, and not a wall, is nearest
+
+
+@dataclass(frozen=True)
+class WorkspaceConfig:
+    """How fields are read.
+
+    Args:
+        floor_tolerance: a floor sphere is exempt while |f(c) - c_z| is at most this [m], that is while the floor
+            z = 0 is what is nearest to it, and f increases upwards. Covers the error of a mapped floor.
+        unknown_confidence: space of lower confidence counts as blocked in searches and has at least the cost c(0)
+            of a surface, where the field offers confidence; None takes the field at its word.
+        chunk: most points in one query of the field, to bound memory.
+    """
+
+    floor_tolerance: float = 0.06
+    unknown_confidence: float | None = None
+    chunk: int = 100_000
+
+    def __post_init__(self) -> None:
+        if self.floor_tolerance < 0 or self.chunk < 1:
+            raise ConfigError(
+                f"WorkspaceConfig: floor_tolerance must be >= 0 m and chunk >= 1, got {self.floor_tolerance:g} and {self.chunk}."
+            )
+
+
+class Workspace:
+    """A robot's spheres in a distance field or in a cost field over one.
+
+    Args:
+        robot: gives radii and, where it offers them, floor spheres.
+        sdf: what to keep clear of.
+        eps: range [m] of the cost c of a distance field; a cost field brings its own.
+        config: rules for the floor and for unknown space.
+
+    Raises:
+        FieldError: if `sdf` is neither a DistanceField nor a CostField.
+    """
+
+    def __init__(
+        self, robot: SphereRobot, sdf: DistanceField | CostField, eps: float, config: WorkspaceConfig | None = None
+    ) -> None:
+        self.config = config or WorkspaceConfig()
+        self.cost_field = sdf if isinstance(sdf, CostField) else None
+        field = sdf.field if isinstance(sdf, CostField) else sdf
+        if not isinstance(field, DistanceField):
+            raise FieldError(
+                f"Workspace: {type(field).__name__} is no field; it needs distance(points) and "
+                "distance_and_gradient(points), or eps, field and cost_and_gradient(points, radii)."
+            )
+        self.field = field
+        self.eps = self.cost_field.eps if self.cost_field else eps
+        self.floor = robot.floor_spheres if isinstance(robot, FloorRobot) and robot.floor_spheres.any() else None
+
+    def clearance(
+        self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, "s"]
+    ) -> Float[Tensor, "*batch s"]:
+        """Clearance f(c) - r [m] of every sphere; +inf where the floor rule exempts it, NaN where the field is."""
+        with torch.no_grad():
+            flat = centres.reshape(-1, 3)
+            distance = torch.cat([self.field.distance(p) for p in flat.split(self.config.chunk)])
+            distance = distance.view(centres.shape[:-1])
+        return (distance - radii).masked_fill(self._on_floor(distance, centres), torch.inf)
+
+    def unknown(self, centres: Float[Tensor, "*batch s 3"]) -> Bool[Tensor, "*batch s"] | None:
+        """Which spheres are centred in unknown space; None where nothing counts as unknown."""
+        threshold = self.config.unknown_confidence
+        if threshold is None or not isinstance(self.field, ConfidentField):
+            return None
+        with torch.no_grad():
+            flat = centres.reshape(-1, 3)
+            confidence = torch.cat([self.field.confidence(p) for p in flat.split(self.config.chunk)])
+        return (confidence < threshold).view(centres.shape[:-1])
+
+    def cost_and_gradient(
+        self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, "s"]
+    ) -> tuple[Float[Tensor, "*batch s"], Float[Tensor, "*batch s 3"]]:
+        """Cost c of every sphere and its gradient with respect to the centres, without a graph."""
+        if self.cost_field is not None:
+            cost, gradient = self.cost_field.cost_and_gradient(centres, radii)
+            cost, gradient = cost.detach(), gradient.detach()
+            if self.floor is not None:
+                near = centres[..., self.floor, :]
+                with torch.no_grad():
+                    exempt = torch.zeros_like(cost, dtype=torch.bool)
+                    exempt[..., self.floor] = self._on_floor(self.field.distance(near), near, all_floor=True)
+                cost, gradient = cost.masked_fill(exempt, 0.0), gradient.masked_fill(exempt.unsqueeze(-1), 0.0)
+        else:
+            distance, gradient = self.field.distance_and_gradient(centres)
+            distance, gradient = distance.detach(), gradient.detach()
+            cost, slope = hinge_cost(distance - radii, self.eps)
+            exempt = self._on_floor(distance, centres, gradient)
+            cost, slope = cost.masked_fill(exempt, 0.0), slope.masked_fill(exempt, 0.0)
+            gradient = slope.unsqueeze(-1) * gradient
+        unknown = self.unknown(centres)
+        if unknown is not None:
+            cost = torch.where(unknown, cost.clamp_min(0.5 * self.eps), cost)
+        return cost, gradient
+
+    def _on_floor(
+        self,
+        distance: Float[Tensor, "*batch s"],
+        centres: Float[Tensor, "*batch s 3"],
+        gradient: Float[Tensor, "*batch s 3"] | None = None,
+        all_floor: bool = False,
+    ) -> Bool[Tensor, "*batch s"]:
+        """Which spheres may touch what is nearest to them because it is the floor.
+
+        The distance alone would also excuse a wall that is nearly as near as the floor, up to the tolerance deep
+        in the sphere; so the field must also increase upwards there.
+        """
+        if self.floor is None:
+            return torch.zeros_like(distance, dtype=torch.bool)
+        candidates = (distance - centres[..., 2]).abs() <= self.config.floor_tolerance
+        if not all_floor:
+            candidates = candidates & self.floor
+        if gradient is not None:
+            return candidates & (gradient[..., 2] > MIN_FLOOR_SLOPE)
+        if candidates.any():
+            _, gradient = self.field.distance_and_gradient(centres[candidates])
+            candidates[candidates.clone()] = gradient[..., 2] > MIN_FLOOR_SLOPE
+        return candidates
