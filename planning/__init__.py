@@ -1,12 +1,15 @@
 """Trajectories for robots covered by spheres, through any signed distance field.
 
-The closed-loop base tracker needs casadi and is imported on its own: `from planning.tracking import BaseTracker`.
+The closed-loop base tracker needs casadi and is imported on its own: `from planning.tracking import
+BaseTracker`.
 """
 
 from planning.chomp import Chomp, ChompConfig
 from planning.errors import ConfigError, FieldError, PlanningError, SolverError, TrajectoryError
+from planning.initialise import NoPath, RrtConfig, rrt_connect
 from planning.metric import MetricConfig
 from planning.objective import ObjectiveConfig
+from planning.plan import Planner, PlannerConfig
 from planning.protocols import (
     ConfidentField,
     CostField,
@@ -17,6 +20,7 @@ from planning.protocols import (
     SphereRobot,
 )
 from planning.result import PlanResult, Status
+from planning.timing import retime
 from planning.trajectory import Trajectory
 from planning.validation import Validation, ValidationConfig, check
 from planning.workspace import WorkspaceConfig
@@ -32,9 +36,13 @@ __all__ = [
     "FloorRobot",
     "LinkedRobot",
     "MetricConfig",
+    "NoPath",
     "ObjectiveConfig",
     "PlanResult",
+    "Planner",
+    "PlannerConfig",
     "PlanningError",
+    "RrtConfig",
     "SelfCollidingRobot",
     "SolverError",
     "SphereRobot",
@@ -45,4 +53,6 @@ __all__ = [
     "ValidationConfig",
     "WorkspaceConfig",
     "check",
+    "retime",
+    "rrt_connect",
 ]

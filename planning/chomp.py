@@ -33,17 +33,18 @@ class ChompConfig:
         metric: derivatives whose squares are the smoothness, and with it the metric A of the update.
         objective: weights of the parts of the objective.
         validation: the dense check that has the last word.
-        step: first step size 1 / eta of the update; it grows by a fifth after each decrease and halves after each
-            increase of the objective (which is undone).
+        step: first step size 1 / eta of the update; it grows by a fifth after each decrease and halves after
+            each increase of the objective (which is undone).
         max_update: no joint of any waypoint moves further than this in one iteration [rad | m].
         max_iterations: most evaluations of the objective.
-        tolerance: the cost is on a plateau when it fell by less than this fraction over `patience` iterations.
+        tolerance: the cost is on a plateau when it fell by less than this fraction over `patience`
+            iterations.
         patience: see tolerance.
         polish: most iterations after the trajectory is free, for smoothness.
-        max_tightenings: how often a plateau in collision is answered by a four times smaller smoothness weight
-            (waypoints collide) or by twice as many states a segment (only the motion in between does).
-        perturbation: size [rad | m] of the smooth random offset given to a trajectory that starts in collision, so
-            that one through the middle of an obstacle can choose a side.
+        max_tightenings: how often a plateau in collision is answered by a four times smaller smoothness
+            weight (waypoints collide) or by twice as many states a segment (only the motion in between does).
+        perturbation: size [rad | m] of the smooth random offset given to a trajectory that starts in
+            collision, so that one through the middle of an obstacle can choose a side.
     """
 
     eps: float = 0.1
@@ -61,7 +62,9 @@ class ChompConfig:
 
     def __post_init__(self) -> None:
         if min(self.eps, self.step, self.max_update) <= 0 or self.patience < 1:
-            raise ConfigError(f"ChompConfig: eps, step, max_update and patience must be positive, got {self}.")
+            raise ConfigError(
+                f"ChompConfig: eps, step, max_update and patience must be positive, got {self}."
+            )
 
 
 class Chomp:
@@ -81,13 +84,15 @@ class Chomp:
             deadline: wall time [s] allowed for the descent; the final check comes on top.
 
         Returns:
-            The best trajectory found (valid before free before cheap), with the verdict of the dense check on it.
+            The best trajectory found (valid before free before cheap), with the verdict of the dense check
+            on it.
 
         Raises:
             TrajectoryError: if the trajectory does not fit the robot.
         """
         robot, config = self.robot, self.config
-        started, history = time.perf_counter(), []
+        started = time.perf_counter()
+        history: list[float] = []
         late = _Deadline(started, deadline)
         verdict = check_ends(robot, trajectory, sdf, config.validation)
         if verdict.success and len(trajectory) < 3:

@@ -56,10 +56,10 @@ def arc_length_cost(
 
 def self_collision_cost(
     centres: Float[Tensor, "n s 3"],
-    radii: Float[Tensor, "s"],
+    radii: Float[Tensor, " s"],
     pairs: Int[Tensor, "p 2"],
     eps: float,
-) -> tuple[Float[Tensor, ""], Float[Tensor, "n s 3"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, ""], Float[Tensor, "n s 3"], Float[Tensor, " n"]]:
     """Sum over waypoints and pairs of c(gap between two spheres), averaged over the waypoints.
 
     Returns:

@@ -17,8 +17,8 @@ def project_to_limits(
 ) -> Float[Tensor, "n_interior dof"]:
     """Bring interior waypoints within the limits by smooth corrections A^-1 v (CHOMP, section 3.5).
 
-    v is the violation; each round scales the correction of a joint so that its worst waypoint lands on its limit.
-    What is left after the last round is clamped.
+    v is the violation; each round scales the correction of a joint so that its worst waypoint lands on its
+    limit. What is left after the last round is clamped.
     """
     low, high = limits.to(q).unbind(dim=1)
     for _ in range(iterations):

@@ -1,4 +1,4 @@
-"""The metric A of covariant gradient descent: what makes two trajectories near each other (CHOMP, section 3.3)."""
+"""The metric A of covariant gradient descent: which trajectories are near each other (CHOMP, section 3.3)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class MetricConfig:
 
     Args:
         velocity: weight of the squared velocity. On its own it gives the shortest way out of an obstacle.
-        acceleration: weight of the squared acceleration; it rounds corners. The default makes bends of about a
-            seventh of the trajectory cost as much as their length does.
+        acceleration: weight of the squared acceleration; it rounds corners. The default makes bends of about
+            a seventh of the trajectory cost as much as their length does.
         jerk: weight of the squared jerk.
         ridge: relative to the largest diagonal entry, added to the diagonal of A for the update only.
     """
@@ -35,23 +35,25 @@ class MetricConfig:
         weights = (self.velocity, self.acceleration, self.jerk)
         if min(weights) < 0 or max(weights) == 0 or self.ridge < 0:
             raise ConfigError(
-                f"MetricConfig: weights must not be negative and one must be positive, got velocity={self.velocity:g}, "
-                f"acceleration={self.acceleration:g}, jerk={self.jerk:g}, ridge={self.ridge:g}."
+                f"MetricConfig: weights must not be negative and one must be positive, got {self}."
             )
 
 
 class Metric:
-    """Smoothness F(q) = 1/2 sum_d w_d |K_d q|^2 of n waypoints and its metric A = sum_d w_d K_d^T K_d + ridge.
+    """Smoothness F(q) = 1/2 sum_d w_d |K_d q|^2 of n waypoints and its metric A = sum_d w_d K_d^T K_d +
+    ridge.
 
     K_d are finite differences of order d; before the first and after the last waypoint the robot rests. The
-    first and last waypoint are fixed, so A is over the n - 2 interior ones. The whole is scaled so that a unit
-    push on the waypoint that gives way most moves it by one unit, whichever derivatives are weighted
+    first and last waypoint are fixed, so A is over the n - 2 interior ones. The whole is scaled so that a
+    unit push on the waypoint that gives way most moves it by one unit, whichever derivatives are weighted
     (CHOMP, equations 10-17). Matrices are kept in float64 (A is ill-conditioned), arguments keep their type.
     """
 
     def __init__(self, num_waypoints: int, config: MetricConfig | None = None) -> None:
         if num_waypoints < 3:
-            raise ConfigError(f"Metric: at least 3 waypoints are needed, got {num_waypoints}; resample first.")
+            raise ConfigError(
+                f"Metric: at least 3 waypoints are needed, got {num_waypoints}; resample first."
+            )
         config = config or MetricConfig()
         step = 1.0 / (num_waypoints - 1)
         full = torch.zeros(num_waypoints, num_waypoints, dtype=torch.float64)
@@ -82,5 +84,7 @@ def _difference_matrix(num_waypoints: int, order: int) -> Float[Tensor, "rows n"
     padded = torch.cat([padded[:1].expand(padding, -1), padded, padded[-1:].expand(padding, -1)])
     for _ in range(order):
         padded = padded.diff(dim=0)
-    assert math.isclose(float(padded.sum(dim=1).abs().max()), 0.0, abs_tol=1e-9)  # a constant has no derivative
+    assert math.isclose(
+        float(padded.sum(dim=1).abs().max()), 0.0, abs_tol=1e-9
+    )  # a constant has no derivative
     return padded

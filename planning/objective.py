@@ -17,7 +17,8 @@ from planning.workspace import Workspace
 
 @dataclass(frozen=True)
 class ObjectiveConfig:
-    """Weights of the objective U = smoothness_weight F + obstacle_weight U_obs + self_collision_weight U_self.
+    """Weights of the objective U = smoothness_weight F + obstacle_weight U_obs + self_collision_weight
+    U_self.
 
     Args:
         smoothness_weight: small, since free paths matter more than short ones.
@@ -38,7 +39,8 @@ class ObjectiveConfig:
         weights = (self.smoothness_weight, self.obstacle_weight, self.self_collision_weight)
         if min(weights) < 0 or self.self_collision_eps <= 0:
             raise ConfigError(
-                f"ObjectiveConfig: weights must not be negative and self_collision_eps must be positive, got {self}."
+                "ObjectiveConfig: weights must not be negative and self_collision_eps must be positive, "
+                f"got {self}."
             )
 
 
@@ -65,7 +67,12 @@ class Objective:
     """
 
     def __init__(
-        self, robot: SphereRobot, workspace: Workspace, metric: Metric, config: ObjectiveConfig, substeps: int = 1
+        self,
+        robot: SphereRobot,
+        workspace: Workspace,
+        metric: Metric,
+        config: ObjectiveConfig,
+        substeps: int = 1,
     ) -> None:
         self.robot, self.workspace, self.metric, self.config = robot, workspace, metric, config
         self.substeps = substeps
@@ -99,8 +106,8 @@ class Objective:
     def tightened(self, waypoints_free: bool) -> Objective:
         """The objective for a trajectory that converged in collision.
 
-        If its waypoints collide, smoothness counts four times less; if only the motion between them does, twice as
-        many states a segment are looked at.
+        If its waypoints collide, smoothness counts four times less; if only the motion between them does,
+        twice as many states a segment are looked at.
         """
         config, substeps = self.config, self.substeps
         if waypoints_free:

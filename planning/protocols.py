@@ -51,7 +51,7 @@ class CostField(Protocol):
         ...
 
     def cost_and_gradient(
-        self, points: Float[Tensor, "*batch 3"], radii: Float[Tensor, "..."]
+        self, points: Float[Tensor, "*batch 3"], radii: Float[Tensor, "*#batch"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Costs [m] of spheres of given radii [m] at points [m], and their gradients, without a graph."""
         ...
@@ -77,11 +77,13 @@ class SphereRobot(Protocol):
         ...
 
     @property
-    def velocity_limits(self) -> Float[Tensor, "dof"]:
+    def velocity_limits(self) -> Float[Tensor, " dof"]:
         """Largest joint speeds [rad/s | m/s]."""
         ...
 
-    def spheres(self, q: Float[Tensor, "*batch dof"]) -> tuple[Float[Tensor, "*batch s 3"], Float[Tensor, "s"]]:
+    def spheres(
+        self, q: Float[Tensor, "*batch dof"]
+    ) -> tuple[Float[Tensor, "*batch s 3"], Float[Tensor, " s"]]:
         """Sphere centres [m, world frame], differentiable by autograd, and radii [m] at configurations q."""
         ...
 
@@ -111,6 +113,6 @@ class FloorRobot(SphereRobot, Protocol):
     """A robot some of whose links drive on the floor z = 0, which is part of every mapped field."""
 
     @property
-    def floor_spheres(self) -> Bool[Tensor, "s"]:
+    def floor_spheres(self) -> Bool[Tensor, " s"]:
         """True for spheres that may touch the floor (and nothing else)."""
         ...

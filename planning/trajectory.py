@@ -25,7 +25,7 @@ class Trajectory:
     """
 
     waypoints: Float[Tensor, "n dof"]
-    times: Float[Tensor, "n"]
+    times: Float[Tensor, " n"]
 
     def __post_init__(self) -> None:
         if len(self.waypoints) == 0:
@@ -34,8 +34,8 @@ class Trajectory:
         if bad.any():
             i = int(bad.nonzero()[0])
             raise TrajectoryError(
-                f"Trajectory: waypoint {i} is {self.waypoints[i].tolist()}; every joint value must be finite. "
-                "Check the inverse kinematics or the state estimate it came from."
+                f"Trajectory: waypoint {i} is {self.waypoints[i].tolist()}; every joint value must be "
+                "finite. Check the inverse kinematics or the state estimate it came from."
             )
         if not torch.isfinite(self.times).all():
             raise TrajectoryError(f"Trajectory: times must be finite, got {self.times.tolist()}.")
@@ -50,8 +50,8 @@ class Trajectory:
     @classmethod
     def line(
         cls,
-        start: Float[Tensor, "dof"],
-        goal: Float[Tensor, "dof"],
+        start: Float[Tensor, " dof"],
+        goal: Float[Tensor, " dof"],
         num_waypoints: int = 50,
         duration: float = 5.0,
     ) -> Trajectory:
@@ -114,7 +114,9 @@ class Trajectory:
     def resampled(self, num_waypoints: int) -> Trajectory:
         """The same motion sampled at `num_waypoints` even times; first and last waypoint stay exact."""
         if num_waypoints < 2:
-            raise TrajectoryError(f"Trajectory.resampled: num_waypoints must be at least 2, got {num_waypoints}.")
+            raise TrajectoryError(
+                f"Trajectory.resampled: num_waypoints must be at least 2, got {num_waypoints}."
+            )
         if len(self) == 1:
             raise TrajectoryError("Trajectory.resampled: one waypoint has no duration; use Trajectory.line.")
         fractions = torch.linspace(0, 1, num_waypoints, dtype=self.times.dtype, device=self.times.device)
@@ -124,7 +126,7 @@ class Trajectory:
 
 
 def _interpolate(
-    knots: Float[Tensor, "n"], values: Float[Tensor, "n dof"], at: Float[Tensor, "*batch"]
+    knots: Float[Tensor, " n"], values: Float[Tensor, "n dof"], at: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch dof"]:
     """Piecewise-linear interpolation of values over non-decreasing knots, clamped to the ends."""
     if len(knots) == 1:

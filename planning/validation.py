@@ -24,8 +24,8 @@ class ValidationConfig:
     """What a valid trajectory is.
 
     Args:
-        max_step: no sphere centre moves further than this [m] between two states tested, so a state in between
-            is at most half of it less clear.
+        max_step: no sphere centre moves further than this [m] between two states tested, so a state in
+            between is at most half of it less clear.
         max_joint_step: no joint moves further than this [rad | m] between two states tested.
         margin: clearance [m] from obstacles that every sphere must keep.
         self_margin: gap [m] that self-collision pairs must keep.
@@ -43,8 +43,8 @@ class ValidationConfig:
     def __post_init__(self) -> None:
         if self.max_step <= 0 or self.max_joint_step <= 0:
             raise ConfigError(
-                f"ValidationConfig: max_step and max_joint_step must be positive, got {self.max_step:g} m and "
-                f"{self.max_joint_step:g}."
+                f"ValidationConfig: max_step and max_joint_step must be positive, got "
+                f"{self.max_step:g} m and {self.max_joint_step:g}."
             )
 
 
@@ -57,7 +57,8 @@ class Validation:
         message: the reason in words.
         clearance: least f - r [m] over all states and spheres; NaN if the field is not finite somewhere.
         self_clearance: least gap [m] of the self-collision pairs; inf without any.
-        waypoint: index of the waypoint at or before the worst state, for the failing test or else the clearance.
+        waypoint: index of the waypoint at or before the worst state, for the failing test or else the
+            clearance.
         time: of the worst state [s].
         link: of the sphere that is worst there, "" if none is.
         states: how many states were tested.
@@ -99,14 +100,16 @@ def check(
 
     if worst_depth.isnan().any():
         i = int(worst_depth.isnan().nonzero()[0])
-        return report.verdict(Status.INVALID_FIELD, i, name(int(worst_sphere[i])), "the field is NaN at {link}")
+        return report.verdict(
+            Status.INVALID_FIELD, i, name(int(worst_sphere[i])), "the field is NaN at {link}"
+        )
     excess = _limit_excess(robot, samples.states)
     if excess.max() > config.limit_tolerance:
         i, joint = divmod(int(excess.argmax()), robot.num_dofs)
         low, high = robot.joint_limits[joint].tolist()
         text = (
-            f"joint {robot.joint_names[joint]} is at {float(samples.states[i, joint]):.4g}, outside its limits "
-            f"[{low:.4g}, {high:.4g}]"
+            f"joint {robot.joint_names[joint]} is at {float(samples.states[i, joint]):.4g}, "
+            f"outside its limits [{low:.4g}, {high:.4g}]"
         )
         return report.verdict(Status.JOINT_LIMITS, i, "", text)
 
@@ -132,7 +135,9 @@ def check(
     j = int(worst_gap.argmin())
     if worst_gap[j] < config.self_margin:
         return report.verdict(Status.SELF_COLLISION, j, name(int(worst_pair[j, 0])), self_text(j))
-    return report.verdict(Status.SUCCESS, i, name(int(worst_sphere[i])), f"clear by {float(worst_depth[i]):.3f} m")
+    return report.verdict(
+        Status.SUCCESS, i, name(int(worst_sphere[i])), f"clear by {float(worst_depth[i]):.3f} m"
+    )
 
 
 def check_ends(
@@ -166,8 +171,8 @@ def check_dofs(robot: SphereRobot, trajectory: Trajectory) -> None:
 @dataclass(frozen=True)
 class _Samples:
     states: Float[Tensor, "m dof"]
-    times: Float[Tensor, "m"]
-    waypoints: Int[Tensor, "m"]  # at or before each state
+    times: Float[Tensor, " m"]
+    waypoints: Int[Tensor, " m"]  # at or before each state
 
 
 @dataclass(frozen=True)
@@ -175,8 +180,8 @@ class _Report:
     robot: SphereRobot
     trajectory: Trajectory
     samples: _Samples
-    depth: Float[Tensor, "m"]
-    gap: Float[Tensor, "m"]
+    depth: Float[Tensor, " m"]
+    gap: Float[Tensor, " m"]
 
     def verdict(self, status: Status, i: int, link: str, text: str) -> Validation:
         waypoint, time = int(self.samples.waypoints[i]), float(self.samples.times[i])
@@ -221,7 +226,7 @@ def _dense_states(robot: SphereRobot, trajectory: Trajectory, config: Validation
     return _Samples(states, torch.cat([times, trajectory.times[-1:]]), waypoints)
 
 
-def _sphere_motion(robot: SphereRobot, states: Float[Tensor, "m dof"]) -> Float[Tensor, "m-1"]:
+def _sphere_motion(robot: SphereRobot, states: Float[Tensor, "m dof"]) -> Float[Tensor, " m-1"]:
     """Largest motion [m] of any sphere between consecutive states."""
     chunk, motions = 2000, []
     with torch.no_grad():
@@ -233,7 +238,7 @@ def _sphere_motion(robot: SphereRobot, states: Float[Tensor, "m dof"]) -> Float[
 
 def _measure(
     robot: SphereRobot, workspace: Workspace, states: Float[Tensor, "m dof"]
-) -> tuple[Float[Tensor, "m"], Int[Tensor, "m"], Float[Tensor, "m"], Int[Tensor, "m 2"]]:
+) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, " m"], Int[Tensor, "m 2"]]:
     """Least clearance and its sphere, least self-collision gap and its pair, for every state."""
     pairs = robot.self_collision_pairs if isinstance(robot, SelfCollidingRobot) else None
     depths, spheres, gaps, worst = [], [], [], []

@@ -20,10 +20,10 @@ class WorkspaceConfig:
     """How fields are read.
 
     Args:
-        floor_tolerance: a floor sphere is exempt while |f(c) - c_z| is at most this [m], that is while the floor
-            z = 0 is what is nearest to it, and f increases upwards. Covers the error of a mapped floor.
-        unknown_confidence: space of lower confidence counts as blocked in searches and has at least the cost c(0)
-            of a surface, where the field offers confidence; None takes the field at its word.
+        floor_tolerance: a floor sphere is exempt while |f(c) - c_z| is at most this [m], that is while the
+            floor z = 0 is what is nearest to it, and f increases upwards. Covers the error of a mapped floor.
+        unknown_confidence: space of lower confidence counts as blocked in searches and has at least the cost
+            c(0) of a surface, where the field offers confidence; None takes the field at its word.
         chunk: most points in one query of the field, to bound memory.
     """
 
@@ -34,7 +34,8 @@ class WorkspaceConfig:
     def __post_init__(self) -> None:
         if self.floor_tolerance < 0 or self.chunk < 1:
             raise ConfigError(
-                f"WorkspaceConfig: floor_tolerance must be >= 0 m and chunk >= 1, got {self.floor_tolerance:g} and {self.chunk}."
+                f"WorkspaceConfig: floor_tolerance must be >= 0 m and chunk >= 1, "
+                f"got {self.floor_tolerance:g} and {self.chunk}."
             )
 
 
@@ -52,7 +53,11 @@ class Workspace:
     """
 
     def __init__(
-        self, robot: SphereRobot, sdf: DistanceField | CostField, eps: float, config: WorkspaceConfig | None = None
+        self,
+        robot: SphereRobot,
+        sdf: DistanceField | CostField,
+        eps: float,
+        config: WorkspaceConfig | None = None,
     ) -> None:
         self.config = config or WorkspaceConfig()
         self.cost_field = sdf if isinstance(sdf, CostField) else None
@@ -64,12 +69,14 @@ class Workspace:
             )
         self.field = field
         self.eps = self.cost_field.eps if self.cost_field else eps
-        self.floor = robot.floor_spheres if isinstance(robot, FloorRobot) and robot.floor_spheres.any() else None
+        self.floor = (
+            robot.floor_spheres if isinstance(robot, FloorRobot) and robot.floor_spheres.any() else None
+        )
 
     def clearance(
-        self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, "s"]
+        self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, " s"]
     ) -> Float[Tensor, "*batch s"]:
-        """Clearance f(c) - r [m] of every sphere; +inf where the floor rule exempts it, NaN where the field is."""
+        """Clearance f(c) - r [m] of every sphere; +inf where it may touch the floor, NaN where f is."""
         with torch.no_grad():
             flat = centres.reshape(-1, 3)
             distance = torch.cat([self.field.distance(p) for p in flat.split(self.config.chunk)])
@@ -87,7 +94,7 @@ class Workspace:
         return (confidence < threshold).view(centres.shape[:-1])
 
     def cost_and_gradient(
-        self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, "s"]
+        self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, " s"]
     ) -> tuple[Float[Tensor, "*batch s"], Float[Tensor, "*batch s 3"]]:
         """Cost c of every sphere and its gradient with respect to the centres, without a graph."""
         if self.cost_field is not None:
@@ -98,7 +105,10 @@ class Workspace:
                 with torch.no_grad():
                     exempt = torch.zeros_like(cost, dtype=torch.bool)
                     exempt[..., self.floor] = self._on_floor(self.field.distance(near), near, all_floor=True)
-                cost, gradient = cost.masked_fill(exempt, 0.0), gradient.masked_fill(exempt.unsqueeze(-1), 0.0)
+                cost, gradient = (
+                    cost.masked_fill(exempt, 0.0),
+                    gradient.masked_fill(exempt.unsqueeze(-1), 0.0),
+                )
         else:
             distance, gradient = self.field.distance_and_gradient(centres)
             distance, gradient = distance.detach(), gradient.detach()
@@ -120,8 +130,8 @@ class Workspace:
     ) -> Bool[Tensor, "*batch s"]:
         """Which spheres may touch what is nearest to them because it is the floor.
 
-        The distance alone would also excuse a wall that is nearly as near as the floor, up to the tolerance deep
-        in the sphere; so the field must also increase upwards there.
+        The distance alone would also excuse a wall that is nearly as near as the floor, up to the tolerance
+        deep in the sphere; so the field must also increase upwards there.
         """
         if self.floor is None:
             return torch.zeros_like(distance, dtype=torch.bool)

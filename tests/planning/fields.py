@@ -50,7 +50,9 @@ class Box(AutogradField):
     half_size: tuple[float, float, float]
 
     def distance(self, points: Tensor) -> Tensor:
-        beyond = (points - torch.tensor(self.centre).to(points)).abs() - torch.tensor(self.half_size).to(points)
+        beyond = (points - torch.tensor(self.centre).to(points)).abs() - torch.tensor(self.half_size).to(
+            points
+        )
         outside = (beyond.clamp_min(0).square().sum(-1) + 1e-18).sqrt()
         return outside + beyond.amax(-1).clamp_max(0)
 

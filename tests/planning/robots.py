@@ -51,7 +51,9 @@ class Base:
 class PlanarArm:
     """Revolute links in the plane z = 0.5 with spheres along them; non-neighbouring links must not touch."""
 
-    def __init__(self, lengths: tuple[float, ...] = (0.5, 0.5), per_link: int = 5, radius: float = 0.05) -> None:
+    def __init__(
+        self, lengths: tuple[float, ...] = (0.5, 0.5), per_link: int = 5, radius: float = 0.05
+    ) -> None:
         self.lengths, self.per_link, self.radius = lengths, per_link, radius
         self.num_dofs = len(lengths)
         self.joint_names = tuple(f"joint{i + 1}" for i in range(self.num_dofs))
