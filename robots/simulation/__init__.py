@@ -1,0 +1,36 @@
+"""The pybullet world that stands in for the real one: scenes, physics, a depth camera and its noise."""
+
+from robots.simulation.base import DifferentialDrive, DriveConfig
+from robots.simulation.camera import DepthCamera, DepthFrame, PinholeCamera
+from robots.simulation.contacts import Contact
+from robots.simulation.depth_noise import DepthNoise, DepthNoiseConfig
+from robots.simulation.primitives import Box, Cylinder, Primitive, Sphere
+from robots.simulation.rooms import GraspTask
+from robots.simulation.scene_sdf import SceneField
+from robots.simulation.scenes import Scene, available_scenes, load_urdf_scene, make_scene
+from robots.simulation.simulated_robot import MotorConfig, SimulatedRobot
+from robots.simulation.world import World
+
+__all__ = [
+    "Box",
+    "Contact",
+    "Cylinder",
+    "DepthCamera",
+    "DepthFrame",
+    "DepthNoise",
+    "DepthNoiseConfig",
+    "DifferentialDrive",
+    "DriveConfig",
+    "GraspTask",
+    "MotorConfig",
+    "PinholeCamera",
+    "Primitive",
+    "Scene",
+    "SceneField",
+    "SimulatedRobot",
+    "Sphere",
+    "World",
+    "available_scenes",
+    "load_urdf_scene",
+    "make_scene",
+]
