@@ -1,0 +1,43 @@
+"""Neural signed distance fields learned online from posed depth images (iSDF; Ortiz et al., RSS 2022)."""
+
+from .camera import PinholeCamera
+from .cost import CostField
+from .errors import (
+    CameraError,
+    CheckpointError,
+    ConfigError,
+    DatasetError,
+    FrameError,
+    IsdfError,
+    NotReadyError,
+)
+from .field import GridField, NeuralField, bake, query
+from .frames import DepthFrame
+from .keyframes import KeyframeConfig
+from .losses import LossConfig
+from .mapper import Mapper, MapperConfig
+from .network import NetworkConfig
+from .sampling import SamplingConfig
+
+__all__ = [
+    "CameraError",
+    "CheckpointError",
+    "ConfigError",
+    "CostField",
+    "DatasetError",
+    "DepthFrame",
+    "FrameError",
+    "GridField",
+    "IsdfError",
+    "KeyframeConfig",
+    "LossConfig",
+    "Mapper",
+    "MapperConfig",
+    "NetworkConfig",
+    "NeuralField",
+    "NotReadyError",
+    "PinholeCamera",
+    "SamplingConfig",
+    "bake",
+    "query",
+]

@@ -1,0 +1,63 @@
+"""The pinhole camera model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from .errors import CameraError
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Pinhole intrinsics in pixels; OpenCV axes (x right, y down, z forward), pixel centres at integers.
+
+    Raises:
+        CameraError: a focal length or a size is not positive, or a value is not finite.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if not all(math.isfinite(v) for v in values):
+            raise CameraError(f"camera intrinsics must be finite, got fx, fy, cx, cy = {values}")
+        if self.fx <= 0 or self.fy <= 0:
+            raise CameraError(
+                f"focal lengths must be positive pixels, got fx={self.fx}, fy={self.fy}; "
+                "flip the image instead of the focal length"
+            )
+        if self.width < 1 or self.height < 1:
+            raise CameraError(f"image size must be at least 1 x 1, got {self.width} x {self.height}")
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, horizontal_fov: float) -> PinholeCamera:
+        """Square pixels and a centred principal point from a horizontal field of view [rad]."""
+        focal = width / (2 * math.tan(horizontal_fov / 2))
+        return cls(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+
+    def rays(self, pixels: Int[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+        """Viewing directions K^-1 [u, v, 1] in the camera frame, with z = 1 (paper section 4.2).
+
+        A direction times a z-depth [m] is the point seen there. `pixels` holds (u, v) = (column, row).
+        """
+        u, v = pixels[..., 0].float(), pixels[..., 1].float()
+        return torch.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, torch.ones_like(u)], dim=-1)
+
+    def back_project(self, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+        """Points [m] of a whole depth image in the camera frame; invalid pixels (0) land on the origin."""
+        v, u = torch.meshgrid(
+            torch.arange(depth.shape[0], device=depth.device),
+            torch.arange(depth.shape[1], device=depth.device),
+            indexing="ij",
+        )
+        return self.rays(torch.stack([u, v], dim=-1)).to(depth.dtype) * depth[..., None]

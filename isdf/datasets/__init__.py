@@ -1,0 +1,5 @@
+"""Recorded depth sequences: reading and writing."""
+
+from .recorded import RecordedSequence, SequenceWriter
+
+__all__ = ["RecordedSequence", "SequenceWriter"]

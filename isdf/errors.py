@@ -1,0 +1,31 @@
+"""Everything `isdf` raises on bad input derives from `IsdfError`."""
+
+from __future__ import annotations
+
+
+class IsdfError(ValueError):
+    """Base of all errors raised by `isdf` for input it cannot accept."""
+
+
+class CameraError(IsdfError):
+    """The camera intrinsics are impossible."""
+
+
+class FrameError(IsdfError):
+    """A depth frame cannot be used: its shape, units, pose or pixels are wrong."""
+
+
+class ConfigError(IsdfError):
+    """A configuration value is outside what is accepted."""
+
+
+class DatasetError(IsdfError):
+    """A recorded sequence is missing files or holds something unreadable."""
+
+
+class CheckpointError(IsdfError):
+    """A saved map is missing, damaged, or of a version this release cannot read."""
+
+
+class NotReadyError(IsdfError):
+    """The map was asked for something it can only give after a first frame."""

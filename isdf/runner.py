@@ -1,0 +1,104 @@
+"""Feeding a recorded sequence to a mapper as a live camera would, by one of two clocks."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from .datasets import RecordedSequence
+from .errors import ConfigError, DatasetError, FrameError
+from .mapper import Mapper, MapperConfig
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class RunReport:
+    """What happened while a sequence was mapped. Times in seconds, of this process's CPU clock over all threads."""
+
+    frames: int = 0
+    frames_used: int = 0
+    frames_dropped: int = 0
+    frames_refused: dict[int, str] = field(default_factory=dict)
+    keyframes: int = 0
+    steps: int = 0
+    sequence_seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    wall_seconds: float = 0.0
+
+
+def run_every_frame(
+    sequence: RecordedSequence, config: MapperConfig, steps_per_frame: int, progress: Callable[[int], None]
+) -> tuple[Mapper, RunReport]:
+    """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take."""
+    if steps_per_frame < 1:
+        raise ConfigError(f"steps_per_frame must be at least 1, got {steps_per_frame}")
+    steps = {"first_frame_steps": steps_per_frame, "steps_per_frame": steps_per_frame, "keyframe_steps": 0}
+    mapper, report = Mapper(replace(config, **steps)), RunReport()
+    cpu, wall = time.process_time(), time.perf_counter()
+    for index in range(len(sequence)):
+        _integrate(mapper, sequence, index, report)
+        progress(index + 1)
+    return mapper, _finish(report, mapper, sequence, cpu, wall)
+
+
+def run_at_rate(
+    sequence: RecordedSequence, config: MapperConfig, cpu_per_second: float, progress: Callable[[int], None]
+) -> tuple[Mapper, RunReport]:
+    """Live: at most `cpu_per_second` CPU seconds for each second of sequence.
+
+    The sequence's clock advances with the CPU time used. When the mapper is ready for another frame it gets the
+    newest that has arrived; those it missed are dropped. While none has arrived it trains on.
+    """
+    if not cpu_per_second > 0:
+        raise ConfigError(f"cpu_per_second must be positive, got {cpu_per_second}")
+    live = replace(config, first_frame_steps=0, steps_per_frame=0, keyframe_steps=0)
+    mapper, report = Mapper(live), RunReport()
+    cpu, wall = time.process_time(), time.perf_counter()
+    budget = len(sequence) / sequence.fps * cpu_per_second
+    patience, last = config.steps_per_frame, -1
+    while (used := time.process_time() - cpu) < budget:
+        newest = min(int(used / cpu_per_second * sequence.fps), len(sequence) - 1)
+        if newest > last and _integrate(mapper, sequence, newest, report):
+            patience = config.steps_per_frame
+        last = newest
+        progress(newest + 1)
+        if mapper.frames_seen == 0:  # nothing usable yet: wait for the next frame without burning time
+            newest_time = (newest + 1) / sequence.fps * cpu_per_second
+            cpu -= max(0.0, newest_time - (time.process_time() - cpu))
+            continue
+        # The paper's rule: a new frame gets its steps before the next one is looked for.
+        for _ in range(max(1, patience)):
+            if time.process_time() - cpu >= budget:
+                break
+            mapper.step()
+        patience = 1
+    report.frames_dropped = len(sequence) - report.frames_used - len(report.frames_refused)
+    progress(len(sequence))
+    return mapper, _finish(report, mapper, sequence, cpu, wall)
+
+
+def _integrate(mapper: Mapper, sequence: RecordedSequence, index: int, report: RunReport) -> bool:
+    """Give one frame to the mapper; an unusable one is recorded and passed over, as a live camera's would be."""
+    try:
+        mapper.integrate(sequence[index])
+    except (FrameError, DatasetError) as error:
+        logger.warning("frame %d passed over: %s", index, error)
+        report.frames_refused[index] = str(error)
+        return False
+    report.frames_used += 1
+    return True
+
+
+def _finish(report: RunReport, mapper: Mapper, sequence: RecordedSequence, cpu: float, wall: float) -> RunReport:
+    if mapper.frames_seen == 0:
+        raise DatasetError(
+            f"{sequence.folder}: none of the {len(sequence)} frames could be used; the first was refused because "
+            f"{next(iter(report.frames_refused.values()), 'it never arrived')}"
+        )
+    report.frames, report.keyframes, report.steps = len(sequence), len(mapper.keyframes), mapper.steps
+    report.sequence_seconds = len(sequence) / sequence.fps
+    report.cpu_seconds, report.wall_seconds = time.process_time() - cpu, time.perf_counter() - wall
+    return report

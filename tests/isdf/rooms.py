@@ -1,0 +1,86 @@
+"""Analytic rooms and a depth camera that sphere-traces them: known geometry to test the mapper against."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from isdf import DepthFrame, PinholeCamera
+
+SDF = Callable[[Tensor], Tensor]
+
+
+def box(centre: tuple[float, float, float], size: tuple[float, float, float]) -> SDF:
+    """A solid box."""
+
+    def distance(p: Tensor) -> Tensor:
+        q = (p - torch.tensor(centre).to(p)).abs() - 0.5 * torch.tensor(size).to(p)
+        return q.clamp(min=0).norm(dim=-1) + q.amax(dim=-1).clamp(max=0)
+
+    return distance
+
+
+def ball(centre: tuple[float, float, float], radius: float) -> SDF:
+    """A solid ball."""
+    return lambda p: (p - torch.tensor(centre).to(p)).norm(dim=-1) - radius
+
+
+def inside_of(sdf: SDF) -> SDF:
+    """The hollow of a solid: a room instead of a block."""
+    return lambda p: -sdf(p)
+
+
+def union(*sdfs: SDF) -> SDF:
+    """Composition by min."""
+    return lambda p: torch.stack([s(p) for s in sdfs]).amin(dim=0)
+
+
+def furnished_room() -> SDF:
+    """5 x 4 x 2.5 m with a table, a cupboard and a ball on the floor; exact outside the solids."""
+    legs = [box((x, y, 0.35), (0.06, 0.06, 0.7)) for x in (0.6, 1.6) for y in (0.2, 0.8)]
+    return union(
+        inside_of(box((0, 0, 1.25), (5, 4, 2.5))),
+        box((1.1, 0.5, 0.72), (1.2, 0.8, 0.05)),
+        *legs,
+        box((-2.0, 1.2, 0.9), (0.6, 1.2, 1.8)),
+        ball((-0.6, -1.0, 0.35), 0.35),
+    )
+
+
+def look_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
+    """T_world_camera with OpenCV axes, z up in the world."""
+    position, forward = np.array(eye, float), np.array(target, float) - np.array(eye, float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = position
+    return T
+
+
+def render(sdf: SDF, T: np.ndarray, camera: PinholeCamera, time: float = 0.0) -> DepthFrame:
+    """An exact z-depth image by sphere tracing."""
+    v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    rays = camera.rays(torch.stack([u, v], dim=-1)).double()
+    rotation, position = torch.tensor(T[:3, :3]), torch.tensor(T[:3, 3])
+    directions = rays @ rotation.T
+    z = torch.zeros(rays.shape[:2], dtype=torch.float64)
+    for _ in range(200):
+        z = z + sdf(position + z[..., None] * directions) / rays.norm(dim=-1)
+    return DepthFrame(z.float(), T, camera, time)
+
+
+def orbit(sdf: SDF, frames: int, camera: PinholeCamera, fps: float = 10.0) -> list[DepthFrame]:
+    """A camera that turns once about itself near the middle of the room, 1.2 m up and looking slightly down."""
+    out = []
+    for i in range(frames):
+        angle = 2 * math.pi * i / frames
+        eye = (0.3 * math.cos(angle), -0.3 + 0.3 * math.sin(angle), 1.2)
+        target = (eye[0] + math.cos(angle), eye[1] + math.sin(angle), 0.85)
+        out.append(render(sdf, look_at(eye, target), camera, i / fps))
+    return out
