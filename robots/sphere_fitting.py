@@ -19,9 +19,9 @@ from robots.errors import RobotError
 
 # Distances are taken to a dense surface sample; this many points keep their error near a millimetre.
 SURFACE_POINTS = 12_000
-COVER_POINTS = 1_200  # surface points that the greedy cover must contain
-CANDIDATES = 1_200  # random interior ball centres it chooses from
-RESTARTS = 2  # perturbed repetitions of the greedy cover
+COVER_POINTS = 1_500  # surface points that the greedy cover must contain
+CANDIDATES = 1_600  # random interior ball centres it chooses from
+RESTARTS = 5  # perturbed repetitions of the greedy cover
 
 
 @dataclass(frozen=True)
@@ -190,8 +190,7 @@ class BallCover:
                 f"no spheres that protrude at most {overshoot:.3f} m cover the shape; allow more, or a lower `lowest`"
             )
         spheres = self._shrunk(chosen, overshoot)
-        spheres[:, 3] += _protruding(spheres, self.shape.surface_points(4 * COVER_POINTS)).max(initial=0.0)
-        return self._measured(spheres)
+        return self._measured(_grown_to(spheres, self.shape.surface_points(4 * COVER_POINTS)))
 
     def _radii(self, overshoot: float) -> np.ndarray:
         return np.minimum(self._depths + overshoot, self._centres[:, 2] - self._lowest)
@@ -250,6 +249,16 @@ def _greedy_cover(contains: np.ndarray, gain: np.ndarray) -> np.ndarray:
         else:
             kept.append(ball)
     return np.array(kept)
+
+
+def _grown_to(spheres: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Grow, for each point outside of all spheres, the one that needs to grow least."""
+    spheres = spheres.copy()
+    for point in points[_protruding(spheres, points) > 0]:
+        distances = np.linalg.norm(spheres[:, :3] - point, axis=1)
+        nearest = int((distances - spheres[:, 3]).argmin())
+        spheres[nearest, 3] = max(spheres[nearest, 3], distances[nearest])
+    return spheres
 
 
 def _protruding(spheres: np.ndarray, points: np.ndarray) -> np.ndarray:

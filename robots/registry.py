@@ -1,0 +1,97 @@
+"""Ready-made robots by name: `load("tiago")` and `load("panda")`, from the example-robot-data package."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from robots.errors import UnknownRobotError
+from robots.mesh_paths import example_robot_data
+from robots.model import Gripper, Robot
+from robots.spheres import load_spheres
+from robots.urdf import Attachment, PlanarBase, compose, extract_subtree
+
+DATA = Path(__file__).parent / "data"
+
+# The Franka hand's rated continuous grasping force is 70 N.
+FRANKA_HAND = Gripper(
+    joint_names=("panda_finger_joint1",), open_position=(0.04,), closed_position=(0.0,), max_force=70.0
+)
+
+
+def available() -> tuple[str, ...]:
+    """Names that `load` knows."""
+    return tuple(sorted(_LOADERS))
+
+
+def load(name: str) -> Robot:
+    """A ready-made robot.
+
+    - `tiago`: mobile manipulator; q = base_x, base_y [m], base_yaw [rad], torso_lift_joint [m] and
+      arm_1..7_joint [rad]; the Franka parallel hand on its wrist, a depth camera on its head.
+    - `panda`: the fixed arm; q = panda_joint1..7 [rad].
+
+    Raises `UnknownRobotError` listing the names, and `RobotError` where example-robot-data is missing.
+    """
+    if name not in _LOADERS:
+        raise UnknownRobotError(f"no robot is called {name!r}; available: {', '.join(available())}")
+    return _LOADERS[name]()
+
+
+def tiago_urdf() -> Path:
+    """Compose TIAGo without a hand, the Franka hand and a planar base into one URDF in the user's cache."""
+    data = example_robot_data()
+    hand = extract_subtree(data / "panda_description" / "urdf" / "panda.urdf", "panda_hand")
+    # The tool flange's x axis points out of the wrist, the hand's z axis along its fingers; the back of the
+    # hand, 26 mm behind its origin, sits on the 5 mm flange.
+    mounted = Attachment(
+        hand, "wrist_ft_tool_link", "panda_hand", xyz=(0.031, 0.0, 0.0), rpy=(0.0, math.pi / 2, 0.0)
+    )
+    body = data / "tiago_description" / "robots" / "tiago_no_hand.urdf"
+    return compose(body, [mounted], planar_base=PlanarBase(velocity=0.6, yaw_velocity=1.0), name="tiago")
+
+
+def panda_urdf() -> Path:
+    """Franka's Panda with its hand, mesh paths made absolute, in the user's cache."""
+    return compose(example_robot_data() / "panda_description" / "urdf" / "panda.urdf", name="panda")
+
+
+def _load_tiago() -> Robot:
+    arm = tuple(f"arm_{i}_joint" for i in range(1, 8))
+    postures = {"tucked": TIAGO_TUCKED, "ready": TIAGO_READY}
+    return Robot.from_urdf(
+        tiago_urdf(),
+        load_spheres(DATA / "tiago_spheres.yaml"),
+        joints=("base_x", "base_y", "base_yaw", "torso_lift_joint", *arm),
+        tool_link="panda_hand_tcp",
+        gripper=FRANKA_HAND,
+        named={
+            name: dict(zip(("torso_lift_joint", *arm), values, strict=True)) for name, values in postures.items()
+        },
+        rest=dict(zip(("torso_lift_joint", *arm), TIAGO_TUCKED, strict=True)),
+        head_joints=("head_1_joint", "head_2_joint"),
+        camera_link="xtion_depth_optical_frame",
+    )
+
+
+def _load_panda() -> Robot:
+    joints = tuple(f"panda_joint{i}" for i in range(1, 8))
+    rest = dict(zip(joints, PANDA_READY, strict=True))
+    return Robot.from_urdf(
+        panda_urdf(),
+        load_spheres(DATA / "panda_spheres.yaml"),
+        joints=joints,
+        tool_link="panda_hand_tcp",
+        gripper=FRANKA_HAND,
+        named={"ready": rest},
+        rest=rest,
+    )
+
+
+# Torso [m], then the seven arm joints [rad].
+TIAGO_TUCKED = (0.15, 0.20, -1.34, -0.20, 1.94, -1.57, 1.37, 0.0)
+TIAGO_READY = (0.20, 1.50, -0.60, -3.00, 1.90, -1.57, 0.0, 0.0)
+PANDA_READY = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
+
+_LOADERS: dict[str, Callable[[], Robot]] = {"tiago": _load_tiago, "panda": _load_panda}
