@@ -1,0 +1,55 @@
+"""Robot models for planning: URDFs, collision spheres, inverse kinematics and self filtering.
+
+The pybullet world that stands in for the real one is the subpackage `robots.simulation`, which has to be
+imported by name, since it needs a simulator.
+"""
+
+from robots.errors import (
+    RobotError,
+    SceneError,
+    SphereFileError,
+    UnknownJointError,
+    UnknownLinkError,
+    UnknownRobotError,
+    UrdfError,
+)
+from robots.inverse_kinematics import IkConfig, IkSolution
+from robots.kinematic_tree import KinematicTree
+from robots.model import Gripper, Robot
+from robots.registry import available, load
+from robots.robot_fitting import RobotFitConfig, fit_robot
+from robots.self_filter import remove_robot
+from robots.sphere_fitting import SphereFit, fit_spheres
+from robots.spheres import SphereSet, load_spheres, save_spheres
+from robots.swept_base import SweptBase
+from robots.urdf import Attachment, PlanarBase, compose, extract_subtree
+
+__all__ = [
+    "Attachment",
+    "Gripper",
+    "IkConfig",
+    "IkSolution",
+    "KinematicTree",
+    "PlanarBase",
+    "Robot",
+    "RobotError",
+    "RobotFitConfig",
+    "SceneError",
+    "SphereFileError",
+    "SphereFit",
+    "SphereSet",
+    "SweptBase",
+    "UnknownJointError",
+    "UnknownLinkError",
+    "UnknownRobotError",
+    "UrdfError",
+    "available",
+    "compose",
+    "extract_subtree",
+    "fit_robot",
+    "fit_spheres",
+    "load",
+    "load_spheres",
+    "remove_robot",
+    "save_spheres",
+]

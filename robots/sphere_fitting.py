@@ -21,6 +21,7 @@ from robots.errors import RobotError
 SURFACE_POINTS = 12_000
 COVER_POINTS = 1_500  # surface points that the greedy cover must contain
 CANDIDATES = 1_600  # random interior ball centres it chooses from
+GROWTH_POINTS = 20_000  # surface points that the final radii must contain
 RESTARTS = 5  # perturbed repetitions of the greedy cover
 
 
@@ -190,7 +191,7 @@ class BallCover:
                 f"no spheres that protrude at most {overshoot:.3f} m cover the shape; allow more, or a lower `lowest`"
             )
         spheres = self._shrunk(chosen, overshoot)
-        return self._measured(_grown_to(spheres, self.shape.surface_points(4 * COVER_POINTS)))
+        return self._measured(_grown_to(spheres, self.shape.surface_points(GROWTH_POINTS)))
 
     def _radii(self, overshoot: float) -> np.ndarray:
         return np.minimum(self._depths + overshoot, self._centres[:, 2] - self._lowest)
