@@ -260,17 +260,18 @@ def _extend(
 
 def shortcut(
     space: StateSpace, path: Float[Tensor, "k dof"], generator: torch.Generator, deadline: float
-) -> Float[Tensor, "k dof"]:
+) -> Float[Tensor, "shorter dof"]:
     """Replace stretches of a free path by straight edges where these are free and shorter.
 
-    Each round draws pairs of points along the path and takes the free shortcut that saves most.
+    Each round draws pairs of points and of vertices along the path and takes the free shortcut that saves most.
     """
     for _ in range(space.config.shortcut_rounds):
         if len(path) == 2 or time.perf_counter() > deadline:
             break
         arc = torch.cat([path.new_zeros(1), space.length(path.diff(dim=0)).cumsum(0)])
-        ends = torch.rand(16, 2, generator=generator).to(arc).sort(dim=1).values * arc[-1]
-        ends[0] = torch.stack([arc[0], arc[-1]])
+        anywhere = torch.rand(12, 2, generator=generator).to(arc) * arc[-1]
+        vertices = arc[torch.randint(len(arc), (12, 2), generator=generator)]
+        ends = torch.cat([anywhere, vertices]).sort(dim=1).values
         segment = torch.searchsorted(arc, ends, right=True).clamp_max(len(arc) - 1) - 1
         weight = ((ends - arc[segment]) / (arc[segment + 1] - arc[segment]).clamp_min(1e-12)).clamp(0, 1)
         points = torch.lerp(path[segment], path[segment + 1], weight.unsqueeze(-1))

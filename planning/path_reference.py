@@ -74,6 +74,11 @@ class PathReference:
         """[m]."""
         return float(self._arc[-1])
 
+    @property
+    def near_end(self) -> bool:
+        """Whether the end is within the stretch searched ahead, and not only nearby."""
+        return self.length - self._progress < LOOK_AHEAD
+
     def advance(self, position: Float[ndarray, " 2"]) -> None:
         """Move on to the point nearest to a position; never back."""
         ahead = np.linspace(self._progress, min(self._progress + LOOK_AHEAD, self.length), 121)
@@ -104,7 +109,7 @@ class PathReference:
         )
 
     def _speed_profile(
-        self, wanted: Float[ndarray, " n-1"], motion: MotionLimits, slowest: float
+        self, wanted: Float[ndarray, " e"], motion: MotionLimits, slowest: float
     ) -> tuple[Float[ndarray, " g"], Float[ndarray, " g"]]:
         """Speeds on a grid of arc lengths: as wanted, slower in bends, braking ahead of them."""
         self._braking = motion.braking

@@ -35,7 +35,8 @@ def retime(
 
     Returns:
         A trajectory from time 0 whose segment velocities, and their differences over half the two segments'
-        times (from rest at the first and to rest at the last waypoint), keep the limits.
+        times (from rest at the first and to rest at the last waypoint), keep the limits. Its times are float64,
+        since rounding them would break the limits.
 
     Raises:
         ConfigError: if limits are not positive, are not one a joint, or leave a moving joint unlimited.
@@ -50,7 +51,7 @@ def retime(
     path = _subdivided(trajectory.waypoints)
     if len(path) == 1:
         still = path.expand(2, -1).clone()
-        return Trajectory(still, torch.tensor([0.0, MIN_DURATION]).to(path))
+        return Trajectory(still, torch.tensor([0.0, MIN_DURATION], dtype=torch.float64))
     exact = path.double()
     ds = exact.diff(dim=0).norm(dim=1)
     tangent = exact.diff(dim=0) / ds[:, None]
@@ -58,10 +59,7 @@ def retime(
     if not torch.isfinite(speed).all():
         raise ConfigError("retime: a joint that moves has neither a velocity nor an acceleration limit.")
     dt = 2 * ds / (speed[:-1] + speed[1:])
-    # Rounding of the times to the waypoints' type must not break a limit: stretch by a hair.
-    stretch = 1 + 1e3 * len(path) * torch.finfo(path.dtype).eps if path.dtype != torch.float64 else 1 + 1e-9
-    times = torch.cat([dt.new_zeros(1), dt.cumsum(0)]) * stretch
-    return Trajectory(path, times.to(path))
+    return Trajectory(path, torch.cat([dt.new_zeros(1), dt.cumsum(0)]) * (1 + 1e-9))  # a hair for rounding
 
 
 def _subdivided(waypoints: Float[Tensor, "n dof"]) -> Float[Tensor, "m dof"]:
@@ -80,11 +78,11 @@ def _subdivided(waypoints: Float[Tensor, "n dof"]) -> Float[Tensor, "m dof"]:
 
 
 def _speed_limit(
-    ds: Float[Tensor, " m-1"],
-    tangent: Float[Tensor, "m-1 dof"],
+    ds: Float[Tensor, " e"],
+    tangent: Float[Tensor, "e dof"],
     v_max: Float[Tensor, " dof"],
     a_max: Float[Tensor, " dof"],
-) -> Float[Tensor, " m"]:
+) -> Float[Tensor, " e+1"]:
     """Path speed allowed at each waypoint by the velocities and by how sharply the path turns around it."""
     segment = (v_max / tangent.abs()).amin(dim=1)
     limit = torch.full((len(ds) + 1,), torch.inf, dtype=ds.dtype)
@@ -98,9 +96,7 @@ def _speed_limit(
     return limit
 
 
-def _tangential_limit(
-    tangent: Float[Tensor, "m-1 dof"], a_max: Float[Tensor, " dof"]
-) -> Float[Tensor, " m-1"]:
+def _tangential_limit(tangent: Float[Tensor, "e dof"], a_max: Float[Tensor, " dof"]) -> Float[Tensor, " e"]:
     """Acceleration along the path allowed on each segment, given its tangent and its neighbours'."""
     steepest = tangent.abs().clone()
     steepest[1:] = torch.maximum(steepest[1:], tangent[:-1].abs())
@@ -109,7 +105,7 @@ def _tangential_limit(
 
 
 def _speed_profile(
-    ds: Float[Tensor, " m-1"], limit: Float[Tensor, " m"], acceleration: Float[Tensor, " m-1"]
+    ds: Float[Tensor, " e"], limit: Float[Tensor, " m"], acceleration: Float[Tensor, " e"]
 ) -> Float[Tensor, " m"]:
     """The fastest path speeds from rest to rest: speeding up forwards, then braking backwards."""
     squares = limit.square().tolist()

@@ -130,7 +130,8 @@ class BaseTracker:
         reference.advance(state[:2])
         error = math.hypot(*(reference.end - state[:2]))
         # Once arrived, turning in place must not be called off by a little drift.
-        self._arrived = error <= (2 if self._arrived else 1) * config.position_tolerance
+        tolerance = (2 if self._arrived else 1) * config.position_tolerance
+        self._arrived = reference.near_end and error <= tolerance
         if self._arrived:
             turn = 0.0 if final_yaw is None else wrapped(final_yaw - float(state[2]))
             done = abs(turn) <= config.yaw_tolerance

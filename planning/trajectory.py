@@ -135,4 +135,4 @@ def _interpolate(
     left = right - 1
     width = knots[right] - knots[left]
     weight = ((at - knots[left]) / width.clamp_min(torch.finfo(knots.dtype).tiny)).clamp(0, 1)
-    return torch.lerp(values[left], values[right], weight.unsqueeze(-1))
+    return torch.lerp(values[left], values[right], weight.to(values).unsqueeze(-1))

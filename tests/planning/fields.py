@@ -170,3 +170,9 @@ class HingeCost:
             cost = torch.where(d < 0, self.eps / 2 - d, torch.where(d < self.eps, near, torch.zeros_like(d)))
             (gradient,) = torch.autograd.grad(cost.sum(), points)
         return cost.detach(), gradient
+
+
+def walls_round(x: float) -> Union:
+    """Four walls that close in the square of half size 0.4 m round (x, 0)."""
+    sides = [(0.5, 0.0, 0.1, 0.6), (-0.5, 0.0, 0.1, 0.6), (0.0, 0.5, 0.6, 0.1), (0.0, -0.5, 0.6, 0.1)]
+    return Union(*(Box((x + dx, dy, 0.3), (hx, hy, 1.0)) for dx, dy, hx, hy in sides))
