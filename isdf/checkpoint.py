@@ -60,12 +60,16 @@ def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
     try:
         return _restore(tensors, header, device)
     except (KeyError, TypeError, IndexError, RuntimeError, AttributeError, IsdfError) as error:
-        raise CheckpointError(f"{path}: the map is incomplete or inconsistent ({error}); map again") from error
+        raise CheckpointError(
+            f"{path}: the map is incomplete or inconsistent ({error}); map again"
+        ) from error
 
 
 def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     if not path.is_file():
-        raise CheckpointError(f"{path}: no such file; a map is written by mapper.save(path) or `isdf map --out`")
+        raise CheckpointError(
+            f"{path}: no such file; a map is written by mapper.save(path) or `isdf map --out`"
+        )
     try:
         with safe_open(str(path), framework="pt") as file:
             header = json.loads((file.metadata() or {}).get("isdf", "null"))

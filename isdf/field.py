@@ -106,7 +106,8 @@ class GridField:
     def __init__(self, values: Float[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], spacing: float) -> None:
         if min(values.shape) < 2 or not spacing > 0:
             raise ConfigError(
-                f"a grid needs at least 2 points an axis and a positive spacing, got {tuple(values.shape)} and {spacing}"
+                f"a grid needs at least 2 points an axis and a positive spacing, "
+                f"got {tuple(values.shape)} and {spacing}"
             )
         self.values, self.origin, self.spacing = values.contiguous(), origin.clone(), float(spacing)
         self.bounds = torch.stack(
@@ -189,7 +190,9 @@ def query(field: Any, points: np.ndarray) -> dict[str, np.ndarray]:
     """
     array = np.asarray(points)
     if array.ndim != 2 or array.shape[1] != 3 or not np.issubdtype(array.dtype, np.number):
-        raise IsdfError(f"points must be a numeric (n, 3) array of world metres, got {array.dtype} {array.shape}")
+        raise IsdfError(
+            f"points must be a numeric (n, 3) array of world metres, got {array.dtype} {array.shape}"
+        )
     tensor = torch.from_numpy(array.astype(np.float32))
     distance, gradient = field.distance_and_gradient(tensor)
     out = {"distance": distance.numpy(), "gradient": gradient.numpy()}

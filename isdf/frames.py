@@ -58,7 +58,7 @@ class DepthFrame:
                 f"a frame needs the attributes depth, T_world_camera and camera; {type(frame).__name__} has no "
                 f"{', '.join(missing)}. Build one with isdf.DepthFrame(depth, T_world_camera, camera)"
             )
-        return cls(frame.depth, frame.T_world_camera, frame.camera, getattr(frame, "time", 0.0))
+        return cls(frame.depth, frame.T_world_camera, frame.camera, float(getattr(frame, "time", 0.0)))
 
     def to(self, device: torch.device) -> DepthFrame:
         """The same frame on another device; itself where it is there already."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -72,7 +73,11 @@ class KeyframeSet:
 
 
 def render_depth(
-    network: SDFNetwork, depth: Float[Tensor, "r"], direction: Float[Tensor, "r 3"], position: Tensor, samples: int
+    network: Callable[[Tensor], Tensor],
+    depth: Float[Tensor, "r"],
+    direction: Float[Tensor, "r 3"],
+    position: Float[Tensor, "3"],
+    samples: int,
 ) -> Float[Tensor, "r"]:
     """z-depth [m] of the network's first zero crossing along each ray, inf where it has none before 1.2 D."""
     z = torch.linspace(0.05, 1.2, samples, device=depth.device) * depth[:, None]

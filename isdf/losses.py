@@ -39,7 +39,14 @@ class LossConfig:
     noise: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("truncation", "surface_weight", "gradient_weight", "eikonal_weight", "eikonal_from", "noise"):
+        for name in (
+            "truncation",
+            "surface_weight",
+            "gradient_weight",
+            "eikonal_weight",
+            "eikonal_from",
+            "noise",
+        ):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be zero or more, got {getattr(self, name)}")
 

@@ -105,7 +105,9 @@ class SDFNetwork(nn.Module):
     origin: Tensor
     directions: Tensor
 
-    def __init__(self, config: NetworkConfig, origin: Tensor, generator: torch.Generator | None = None) -> None:
+    def __init__(
+        self, config: NetworkConfig, origin: Tensor, generator: torch.Generator | None = None
+    ) -> None:
         super().__init__()
         self.config = config
         self.register_buffer("origin", origin.detach().clone().float())
@@ -148,23 +150,28 @@ class SDFNetwork(nn.Module):
                 hidden = torch.cat([hidden, embedding], dim=-1)
             hidden, slope = _SoftplusPair.apply(layer(hidden))
             slopes.append(slope)
-        out = self.layers[-1]
+        linears = self._linears
+        out = linears[-1]
         distance = out(hidden)[:, 0] * self.config.output_scale
 
         sensitivity = slopes[-1] * (out.weight * self.config.output_scale)
         embedding_gradient: Tensor | None = None
         for index in range(self.config.hidden_layers, 1, -1):
-            back = sensitivity @ self.layers[index - 1].weight
+            back = sensitivity @ linears[index - 1].weight
             if index == self.config.skip_layer:
                 back, embedding_gradient = back.split([self.config.width, self.embedding_size], dim=-1)
             sensitivity = slopes[index - 2] * back
-        first = sensitivity @ self.layers[0].weight
+        first = sensitivity @ linears[0].weight
         embedding_gradient = first if embedding_gradient is None else embedding_gradient + first
         return distance, self._embedding_vjp(embedding_gradient, sines, cosines)
 
     @property
-    def _hidden(self) -> list[nn.Module]:
-        return list(self.layers)[:-1]
+    def _linears(self) -> list[nn.Linear]:
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+
+    @property
+    def _hidden(self) -> list[nn.Linear]:
+        return self._linears[:-1]
 
     def _embed(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """gamma(x) with the scaled coordinates in front, and its sines and cosines (n, octave, direction)."""

@@ -35,8 +35,10 @@ def run_every_frame(
     """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take."""
     if steps_per_frame < 1:
         raise ConfigError(f"steps_per_frame must be at least 1, got {steps_per_frame}")
-    steps = {"first_frame_steps": steps_per_frame, "steps_per_frame": steps_per_frame, "keyframe_steps": 0}
-    mapper, report = Mapper(replace(config, **steps)), RunReport()
+    config = replace(
+        config, first_frame_steps=steps_per_frame, steps_per_frame=steps_per_frame, keyframe_steps=0
+    )
+    mapper, report = Mapper(config), RunReport()
     cpu, wall = time.process_time(), time.perf_counter()
     for index in range(len(sequence)):
         _integrate(mapper, sequence, index, report)
@@ -92,7 +94,9 @@ def _integrate(mapper: Mapper, sequence: RecordedSequence, index: int, report: R
     return True
 
 
-def _finish(report: RunReport, mapper: Mapper, sequence: RecordedSequence, cpu: float, wall: float) -> RunReport:
+def _finish(
+    report: RunReport, mapper: Mapper, sequence: RecordedSequence, cpu: float, wall: float
+) -> RunReport:
     if mapper.frames_seen == 0:
         raise DatasetError(
             f"{sequence.folder}: none of the {len(sequence)} frames could be used; the first was refused because "

@@ -76,9 +76,7 @@ class RayBatch:
         return self.surface_along[:, None] - self.along
 
 
-def sample_rays(
-    frames: Sequence[DepthFrame], config: SamplingConfig, generator: torch.Generator
-) -> RayBatch:
+def sample_rays(frames: Sequence[DepthFrame], config: SamplingConfig, generator: torch.Generator) -> RayBatch:
     """Draw random valid pixels of each frame, and points along their rays.
 
     Frames with fewer valid pixels than asked give what they have, with repetition.
@@ -125,9 +123,7 @@ def _usable(depth: Tensor, config: SamplingConfig) -> Tensor:
     return (depth > 0) & (depth <= config.max_depth)
 
 
-def normals_at(
-    frame: DepthFrame, pixels: Int[Tensor, "n 2"], step: int
-) -> Float[Tensor, "n 3"]:
+def normals_at(frame: DepthFrame, pixels: Int[Tensor, "n 2"], step: int) -> Float[Tensor, "n 3"]:
     """Unit surface normals in the world frame, towards the camera, from the gradient of the depth image.
 
     NaN where a neighbour is invalid, outside the image, or across a depth edge (more than 10 % of the depth).

@@ -1,8 +1,8 @@
 """The recorded-sequence folder format.
 
-    depth/%06d.png   16-bit PNG, metres = value / depth_scale; 0 and the listed invalid values are no measurement
-    poses.txt        a line a frame: index, then 16 numbers, row-major T_world_camera [m], OpenCV camera axes
-    intrinsics.json  fx fy cx cy width height depth_scale, optionally fps and invalid_values (or invalid)
+depth/%06d.png   16-bit PNG, metres = value / depth_scale; 0 and the listed invalid values are no measurement
+poses.txt        a line a frame: index, then 16 numbers, row-major T_world_camera [m], OpenCV camera axes
+intrinsics.json  fx fy cx cy width height depth_scale, optionally fps and invalid_values (or invalid)
 """
 
 from __future__ import annotations
@@ -89,7 +89,9 @@ class SequenceWriter:
         names = ("fx", "fy", "cx", "cy", "width", "height")
         values = {n: getattr(camera, n) for n in names} | {"depth_scale": depth_scale, "fps": fps}
         (self.folder / "intrinsics.json").write_text(json.dumps(values, indent=1) + "\n")
-        (self.folder / "poses.txt").write_text("# frame T_world_camera (4x4 row-major, OpenCV axes, metres)\n")
+        (self.folder / "poses.txt").write_text(
+            "# frame T_world_camera (4x4 row-major, OpenCV axes, metres)\n"
+        )
         self.count = 0
 
     def write(self, depth: np.ndarray, T_world_camera: np.ndarray) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -67,12 +68,23 @@ def render(sdf: SDF, T: np.ndarray, camera: PinholeCamera, time: float = 0.0) ->
     """An exact z-depth image by sphere tracing."""
     v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     rays = camera.rays(torch.stack([u, v], dim=-1)).double()
-    rotation, position = torch.tensor(T[:3, :3]), torch.tensor(T[:3, 3])
-    directions = rays @ rotation.T
-    z = torch.zeros(rays.shape[:2], dtype=torch.float64)
-    for _ in range(200):
-        z = z + sdf(position + z[..., None] * directions) / rays.norm(dim=-1)
-    return DepthFrame(z.float(), T, camera, time)
+    pose = torch.as_tensor(T, dtype=torch.float64)
+    directions = (rays @ pose[:3, :3].T).view(-1, 3)
+    z, active = torch.zeros(len(directions), dtype=torch.float64), torch.arange(len(directions))
+    for _ in range(300):
+        gap = sdf(pose[:3, 3] + z[active, None] * directions[active])
+        z[active] += gap / directions[active].norm(dim=-1)
+        active = active[(gap > 1e-5) & (z[active] < 30.0)]
+        if len(active) == 0:
+            break
+    return DepthFrame(z.float().view(rays.shape[:2]), T, camera, time)
+
+
+@functools.lru_cache(maxsize=4)
+def furnished_orbit(frames: int, width: int = 80) -> tuple[DepthFrame, ...]:
+    """`orbit` in the furnished room with a 60 degree camera, rendered once for all tests."""
+    camera = PinholeCamera.from_fov(width, width * 3 // 4, math.radians(60))
+    return tuple(orbit(furnished_room(), frames, camera))
 
 
 def orbit(sdf: SDF, frames: int, camera: PinholeCamera, fps: float = 10.0) -> list[DepthFrame]:

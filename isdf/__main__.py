@@ -1,0 +1,5 @@
+"""`python -m isdf` is the `isdf` command."""
+
+from .cli import main
+
+main()

@@ -1,0 +1,151 @@
+"""The `isdf` command: map a recorded sequence, query a map."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+from .datasets import RecordedSequence
+from .errors import ConfigError, IsdfError
+from .field import NeuralField, query
+from .mapper import Mapper, MapperConfig
+from .runner import RunReport, run_at_rate, run_every_frame
+
+MAP_FILE = "map.safetensors"
+
+
+@dataclass(frozen=True)
+class Map:
+    """Map a recorded sequence: leaves the map, mesh.ply, slice pictures and report.json in a folder.
+
+    Give one of two clocks. --steps-per-frame K trains K steps on every frame. --cpu-per-second C is live: at most
+    C CPU seconds (all threads) for each second of sequence; frames that arrive while it is busy are dropped.
+    """
+
+    sequence_dir: tyro.conf.Positional[Path]
+    """Folder with depth/%06d.png, poses.txt and intrinsics.json."""
+    out: Path
+    """Folder for the results; made if missing."""
+    steps_per_frame: int | None = None
+    """Optimisation steps on every frame."""
+    cpu_per_second: float | None = None
+    """CPU seconds allowed for each second of sequence; 1.0 when neither clock is given."""
+    preset: Literal["cpu", "paper", "released"] = "cpu"
+    """cpu: small network, few rays. paper: the text's sizes. released: those behind the published results."""
+    bound: Literal["ray", "normal", "batch"] = "batch"
+    """How the distance of a sample is bounded."""
+    fps: float | None = None
+    """Frames a second; by default what the sequence says, else 30."""
+    mesh_spacing: float = 0.04
+    """Cell size of the mesh [m]."""
+    up: tuple[float, float, float] | None = None
+    """Up direction of the world for slices; by default judged from the camera poses."""
+    slice_heights: tuple[float, ...] = ()
+    """Heights of the slices along up [m]; by default three that divide the observed range."""
+    seed: int = 0
+    """Seed of all random draws."""
+    threads: int = 1
+    """Threads of the matrix library; more than one shortens the wall time but costs CPU time."""
+
+    def run(self) -> None:
+        """Map, then write the results."""
+        if self.steps_per_frame is not None and self.cpu_per_second is not None:
+            raise ConfigError("give --steps-per-frame or --cpu-per-second, not both")
+        torch.set_num_threads(max(1, self.threads))
+        sequence = RecordedSequence(self.sequence_dir, self.fps)
+        config = self._config()
+        with tqdm(total=len(sequence), unit="frame", desc="mapping", disable=None) as bar:
+
+            def progress(done: int) -> None:
+                bar.update(done - bar.n)
+
+            if self.steps_per_frame is not None:
+                mapper, report = run_every_frame(sequence, config, self.steps_per_frame, progress)
+            else:
+                rate = 1.0 if self.cpu_per_second is None else self.cpu_per_second
+                mapper, report = run_at_rate(sequence, config, rate, progress)
+        self._write(mapper, report, sequence)
+
+    def _config(self) -> MapperConfig:
+        presets = {"cpu": MapperConfig(), "paper": MapperConfig.paper(), "released": MapperConfig.released()}
+        return dataclasses.replace(presets[self.preset], seed=self.seed, bound=self.bound)
+
+    def _write(self, mapper: Mapper, report: RunReport, sequence: RecordedSequence) -> None:
+        from .meshing import zero_level_mesh
+        from .slices import estimate_up, save_slices, slice_heights
+
+        self.out.mkdir(parents=True, exist_ok=True)
+        mapper.save(self.out / MAP_FILE)
+        field = mapper.field()
+        up = estimate_up(sequence.poses) if self.up is None else np.array(self.up) / np.linalg.norm(self.up)
+        mesh = zero_level_mesh(field, self.mesh_spacing, up=up)
+        mesh.export(self.out / "mesh.ply")
+        heights = list(self.slice_heights) or slice_heights(field, up)
+        keyframes = np.array([f.T_world_camera[:3, 3].numpy() for f in mapper.keyframes.frames])
+        save_slices(self.out / "slices.png", field, heights, up, sequence.poses, keyframes)
+        summary = dataclasses.asdict(report) | {
+            "sequence": self.sequence_dir.name,
+            "clock": {"steps_per_frame": self.steps_per_frame, "cpu_per_second": self.cpu_per_second},
+            "preset": self.preset,
+            "config": dataclasses.asdict(mapper.config),
+            "bounds": mapper.bounds.tolist(),
+            "up": up.tolist(),
+            "slice_heights": heights,
+            "mesh_vertices": len(mesh.vertices),
+            "mesh_faces": len(mesh.faces),
+        }
+        (self.out / "report.json").write_text(json.dumps(summary, indent=1) + "\n")
+        print(
+            f"{report.frames_used} of {report.frames} frames, {report.keyframes} keyframes, {report.steps} steps in "
+            f"{report.cpu_seconds:.1f} CPU s; {self.out}: {MAP_FILE}, mesh.ply ({len(mesh.faces)} faces), slices.png, "
+            "report.json"
+        )
+
+
+@dataclass(frozen=True)
+class Query:
+    """Distances and gradients of a saved map at any world points."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Folder that `isdf map` wrote, or a map file."""
+    points: Path
+    """A .npy file with an (N, 3) array of world points [m]."""
+    out: Path
+    """The .npz file to write: distance (N,) [m], gradient (N, 3), and confidence (N,) where the field has one."""
+
+    def run(self) -> None:
+        """Load, query, write."""
+        path = self.run_dir / MAP_FILE if self.run_dir.is_dir() else self.run_dir
+        field: NeuralField = Mapper.load(path).field()
+        try:
+            points = np.load(self.points, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise IsdfError(f"{self.points}: not a readable .npy array ({error})") from error
+        answers = query(field, points)
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(self.out, **answers)  # type: ignore[arg-type]
+        print(f"{len(points)} points: {', '.join(answers)} in {self.out}")
+
+
+Command = Annotated[Map, tyro.conf.subcommand("map")] | Annotated[Query, tyro.conf.subcommand("query")]
+
+
+def main() -> None:
+    """Entry point of the `isdf` command; exit code 2 on bad input, with one line that says what was wrong."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    command = tyro.cli(Command, prog="isdf", description="Neural signed distance fields from depth images.")  # type: ignore[arg-type]
+    try:
+        command.run()
+    except IsdfError as error:
+        print(f"isdf: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,120 @@
+"""Pictures of a distance field at constant height, with the camera's path and keyframes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg", force=False)
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Of the same order as the distance at which planners stop caring; farther away all blues look the same.
+COLOUR_LIMIT = 1.5
+
+
+def estimate_up(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3"]:
+    """The world's up direction, judged by how the cameras were held.
+
+    People and robots hold cameras level, so the mean of the image's up direction is close to up. It snaps to the
+    nearest axis when within 25 degrees, since most worlds are aligned with gravity.
+    """
+    up = -np.asarray(poses)[:, :3, 1].mean(axis=0)
+    up /= np.linalg.norm(up)
+    axis = int(np.abs(up).argmax())
+    if abs(up[axis]) > np.cos(np.radians(25)):
+        up = np.sign(up[axis]) * np.eye(3)[axis]
+    return up
+
+
+def slice_basis(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Rows: two horizontal directions and up, right-handed; the world's own axes when up is z."""
+    up = up / np.linalg.norm(up)
+    first = np.eye(3)[int(np.abs(up).argmin())]
+    first = first - up * (first @ up)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first), up])
+
+
+def draw_slice(
+    axes: Axes,
+    field: Any,
+    height: float,
+    up: Float[np.ndarray, "3"],
+    poses: Float[np.ndarray, "n 4 4"] | None = None,
+    keyframes: Float[np.ndarray, "k 3"] | None = None,
+    spacing: float = 0.02,
+) -> Any:
+    """Draw one slice into matplotlib axes; returns the image for a colour bar.
+
+    Args:
+        axes: where to draw; in metres along the two horizontal directions of `slice_basis(up)`.
+        field: a distance field with `bounds`.
+        height: along `up` [m].
+        up: unit vector.
+        poses: T_world_camera of the whole path, drawn as a line.
+        keyframes: camera positions to mark [m].
+        spacing: size of a picture element [m].
+    """
+    basis = slice_basis(up)
+    corners = _corners(field.bounds.cpu().numpy()) @ basis.T
+    (x0, y0, _), (x1, y1, _) = corners.min(axis=0) - 0.2, corners.max(axis=0) + 0.2
+    xs, ys = np.arange(x0, x1, spacing), np.arange(y0, y1, spacing)
+    grid = (
+        np.stack([*np.meshgrid(xs, ys, indexing="xy"), np.full((len(ys), len(xs)), height)], axis=-1) @ basis
+    )
+    distance = field.distance(torch.from_numpy(grid.astype(np.float32))).cpu().numpy()
+    image = axes.imshow(
+        distance,
+        origin="lower",
+        extent=(x0, x1, y0, y1),
+        cmap="coolwarm_r",
+        vmin=-COLOUR_LIMIT,
+        vmax=COLOUR_LIMIT,
+    )
+    axes.contour(xs, ys, distance, levels=[0.0], colors="black", linewidths=1.2)
+    if poses is not None:
+        path = np.asarray(poses)[:, :3, 3] @ basis.T
+        axes.plot(path[:, 0], path[:, 1], color="red", linewidth=1.0)
+    if keyframes is not None and len(keyframes):
+        at = np.asarray(keyframes) @ basis.T
+        axes.plot(at[:, 0], at[:, 1], "o", color="limegreen", markersize=4, markeredgecolor="black")
+    axes.set_aspect("equal")
+    axes.set_title(f"height {height:.2f} m")
+    return image
+
+
+def save_slices(
+    path: str | Path,
+    field: Any,
+    heights: list[float],
+    up: Float[np.ndarray, "3"],
+    poses: Float[np.ndarray, "n 4 4"] | None = None,
+    keyframes: Float[np.ndarray, "k 3"] | None = None,
+) -> None:
+    """One picture with a slice for every height, zero level in black, camera path in red, keyframes in green."""
+    across = np.ptp(_corners(field.bounds.cpu().numpy()) @ slice_basis(up).T, axis=0)
+    figure = Figure(figsize=(5 * len(heights) + 1, 5 * across[1] / across[0] + 0.9), layout="constrained")
+    axes = figure.subplots(1, len(heights), squeeze=False)[0]
+    for ax, height in zip(axes, heights, strict=True):
+        image = draw_slice(ax, field, height, up, poses, keyframes)
+        ax.set_xlabel("[m]")
+    figure.colorbar(image, ax=list(axes), label="signed distance [m]", shrink=0.8)
+    figure.savefig(path, dpi=110)
+
+
+def slice_heights(field: Any, up: Float[np.ndarray, "3"], count: int = 3) -> list[float]:
+    """Heights [m] that divide the observed height range evenly, its ends left out."""
+    along = _corners(field.bounds.cpu().numpy()) @ up
+    return [float(h) for h in np.linspace(along.min(), along.max(), count + 2)[1:-1]]
+
+
+def _corners(bounds: np.ndarray) -> np.ndarray:
+    return np.array(
+        [[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    )
