@@ -67,12 +67,13 @@ def self_collision_cost(
     """
     first, second = pairs[:, 0], pairs[:, 1]
     offset = centres[:, first] - centres[:, second]
-    separation = offset.norm(dim=-1).clamp_min(1e-9)
-    gap = separation - (radii[first] + radii[second])
-    cost, slope = hinge_cost(gap, eps)
-    n = len(centres)
-    push = (slope / (separation * n)).unsqueeze(-1) * offset
-    gradient = torch.zeros_like(centres)
-    gradient.index_add_(1, first, push)
-    gradient.index_add_(1, second, -push)
-    return cost.sum() / n, gradient, gap.amin(dim=1)
+    gap = offset.norm(dim=-1) - (radii[first] + radii[second])
+    n, s = centres.shape[:2]
+    waypoint, pair = (gap < eps).nonzero(as_tuple=True)  # few of many: the rest costs nothing
+    cost, slope = hinge_cost(gap[waypoint, pair], eps)
+    direction = torch.nn.functional.normalize(offset[waypoint, pair], dim=-1, eps=1e-9)
+    push = slope.unsqueeze(-1) * direction / n
+    gradient = centres.new_zeros(n * s, 3)
+    gradient.index_add_(0, waypoint * s + first[pair], push)
+    gradient.index_add_(0, waypoint * s + second[pair], -push)
+    return cost.sum() / n, gradient.view_as(centres), gap.amin(dim=1)

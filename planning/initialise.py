@@ -21,15 +21,21 @@ from planning.workspace import Workspace, WorkspaceConfig
 
 logger = logging.getLogger(__name__)
 
+STATES_AT_ONCE = 2000
+
 
 @dataclass(frozen=True)
 class RrtConfig:
     """How the search samples and when it gives up.
 
     Args:
-        margin: clearance [m] that every state of the path keeps.
+        margin: clearance [m] that every state of the path keeps, unless start or goal have less.
+        min_margin: clearance [m] that start and goal must have; the margin becomes theirs where they are
+            tighter.
         self_margin: gap [m] that self-collision pairs keep.
         batch: samples grown towards in one round.
+        connections: of the nodes added in a round, how many (the nearest to the other tree) are tried to
+            connect.
         reach: longest edge of a round, as the motion [m] of the sphere that moves most.
         resolution: motion [m] of that sphere between two states tested on an edge.
         unlimited_range: joints without limits are sampled this far [rad | m] beyond start and goal.
@@ -41,8 +47,10 @@ class RrtConfig:
     """
 
     margin: float = 0.01
+    min_margin: float = 0.0
     self_margin: float = 0.0
     batch: int = 32
+    connections: int = 8
     reach: float = 0.5
     resolution: float = 0.02
     unlimited_range: float = 3.0
@@ -92,7 +100,8 @@ def rrt_connect(
     for name, q in (("start", start), ("goal", goal)):
         if not space.free(q[None])[0]:
             return NoPath(
-                f"{name} is blocked: in collision, out of limits or within {config.margin:g} m of an obstacle"
+                f"{name} is blocked: in collision, in unknown space, out of limits or within "
+                f"{config.min_margin:g} m of an obstacle"
             )
     generator = torch.Generator().manual_seed(seed)
     path = _grow(space, start, goal, generator, deadline)
@@ -122,6 +131,10 @@ class StateSpace:
         low, high = robot.joint_limits.to(start).unbind(dim=1)
         self.low = torch.where(low.isinf(), torch.minimum(start, goal) - config.unlimited_range, low)
         self.high = torch.where(high.isinf(), torch.maximum(start, goal) + config.unlimited_range, high)
+        with torch.no_grad():
+            ends = self.workspace.clearance(*robot.spheres(torch.stack([start, goal])))
+        tightest = float(ends.min().nan_to_num(config.min_margin))
+        self.margin = max(config.min_margin, min(config.margin, tightest))
         self.weights = self._motion_per_joint(
             torch.lerp(start, goal, torch.tensor([[0.0], [0.5], [1.0]]).to(start))
         )
@@ -159,7 +172,7 @@ class StateSpace:
         config = self.config
         with torch.no_grad():
             centres, radii = self.robot.spheres(q)
-        free = (self.workspace.clearance(centres, radii) >= config.margin).all(dim=-1) & within_limits(
+        free = (self.workspace.clearance(centres, radii) >= self.margin).all(dim=-1) & within_limits(
             self.robot, q
         )
         unknown = self.workspace.unknown(centres)
@@ -172,13 +185,23 @@ class StateSpace:
         return free
 
     def advance(self, start: Float[Tensor, "k dof"], end: Float[Tensor, "k dof"]) -> Float[Tensor, " k"]:
-        """How far each straight edge is free from its start on, as a fraction: 1 if all of it is."""
+        """How far each straight edge is free from its start on, as a fraction: 1 if all of it is.
+
+        States are tested coarsely first, then ever more finely, but none beyond the first that is known to be
+        blocked: most of a blocked edge is never looked at.
+        """
         counts = (self.motion(end - start) / self.config.resolution).ceil().long().clamp_min(1)
         edge = torch.repeat_interleave(torch.arange(len(start)), counts)
         rank = torch.arange(len(edge)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts) + 1
-        states = torch.lerp(start[edge], end[edge], (rank / counts[edge]).to(start)[:, None])
-        free = torch.cat([self.free(part) for part in states.split(2000)])
-        first_blocked = (counts + 1).scatter_reduce(0, edge[~free], rank[~free], "amin")
+        first_blocked = counts + 1
+        untested = torch.ones_like(edge, dtype=torch.bool)
+        for stride in (16, 4, 1):
+            now = untested & (rank < first_blocked[edge]) & ((rank % stride == 0) | (rank == counts[edge]))
+            untested &= ~now
+            e, r = edge[now], rank[now]
+            states = torch.lerp(start[e], end[e], (r / counts[e]).to(start)[:, None])
+            free = torch.cat([self.free(part) for part in states.split(STATES_AT_ONCE)])
+            first_blocked = first_blocked.scatter_reduce(0, e[~free], r[~free], "amin")
         return ((first_blocked - 1) / counts).to(start)
 
 
@@ -233,6 +256,9 @@ def _grow(
         if len(nodes):
             added = here.add(nodes, parents)
             targets = space.nearest(there.nodes, nodes)
+            gaps = space.length(there.nodes[targets] - nodes)
+            nearest = gaps.argsort()[: config.connections]
+            nodes, added, targets = nodes[nearest], added[nearest], targets[nearest]
             reached = space.advance(nodes, there.nodes[targets])
             if (reached == 1).any():
                 i = int((reached == 1).nonzero()[0])
@@ -263,7 +289,8 @@ def shortcut(
 ) -> Float[Tensor, "shorter dof"]:
     """Replace stretches of a free path by straight edges where these are free and shorter.
 
-    Each round draws pairs of points and of vertices along the path and takes the free shortcut that saves most.
+    Each round draws pairs of points and of vertices along the path and takes the free shortcut that saves
+    most.
     """
     for _ in range(space.config.shortcut_rounds):
         if len(path) == 2 or time.perf_counter() > deadline:

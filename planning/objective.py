@@ -25,8 +25,8 @@ class ObjectiveConfig:
         obstacle_weight: of the arc-length functional, summed over spheres.
         self_collision_weight: of the cost of gaps between links, averaged over the waypoints.
         self_collision_eps: gap [m] between links at which their cost starts.
-        margin: clearance [m] from which a waypoint counts as free while optimising. A little more than the
-            check demands, since the check also looks between the waypoints.
+        margin: clearance [m] from which a waypoint counts as free while optimising, or that of start and goal
+            where it is less. A little more than the check demands, since it also looks between the waypoints.
     """
 
     smoothness_weight: float = 0.05
@@ -91,7 +91,10 @@ class Objective:
         cost, cost_gradient = self.workspace.cost_and_gradient(x, radii)
         obstacles, pull = arc_length_cost(x, cost, cost_gradient)
         obstacles, pull = self.config.obstacle_weight * obstacles, self.config.obstacle_weight * pull
-        free = bool((cost <= self._free_cost).all())
+        ends = torch.maximum(
+            cost[0].max(), cost[-1].max()
+        )  # these are valid, or there is nothing to optimise
+        free = bool((cost <= ends.clamp_min(self._free_cost)).all())
         if self._pairs is not None:
             touch, push, gap = self_collision_cost(x, radii, self._pairs, self.config.self_collision_eps)
             obstacles = obstacles + self.config.self_collision_weight * touch

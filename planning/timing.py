@@ -35,8 +35,8 @@ def retime(
 
     Returns:
         A trajectory from time 0 whose segment velocities, and their differences over half the two segments'
-        times (from rest at the first and to rest at the last waypoint), keep the limits. Its times are float64,
-        since rounding them would break the limits.
+        times (from rest at the first and to rest at the last waypoint), keep the limits. Its times are
+        float64, since rounding them would break the limits.
 
     Raises:
         ConfigError: if limits are not positive, are not one a joint, or leave a moving joint unlimited.

@@ -81,7 +81,10 @@ class Workspace:
             flat = centres.reshape(-1, 3)
             distance = torch.cat([self.field.distance(p) for p in flat.split(self.config.chunk)])
             distance = distance.view(centres.shape[:-1])
-        return (distance - radii).masked_fill(self._on_floor(distance, centres), torch.inf)
+        clearance = distance - radii
+        if self.floor is None:
+            return clearance
+        return clearance.masked_fill(self._on_floor(distance[..., self.floor], centres), torch.inf)
 
     def unknown(self, centres: Float[Tensor, "*batch s 3"]) -> Bool[Tensor, "*batch s"] | None:
         """Which spheres are centred in unknown space; None where nothing counts as unknown."""
@@ -101,20 +104,17 @@ class Workspace:
             cost, gradient = self.cost_field.cost_and_gradient(centres, radii)
             cost, gradient = cost.detach(), gradient.detach()
             if self.floor is not None:
-                near = centres[..., self.floor, :]
                 with torch.no_grad():
-                    exempt = torch.zeros_like(cost, dtype=torch.bool)
-                    exempt[..., self.floor] = self._on_floor(self.field.distance(near), near, all_floor=True)
-                cost, gradient = (
-                    cost.masked_fill(exempt, 0.0),
-                    gradient.masked_fill(exempt.unsqueeze(-1), 0.0),
-                )
+                    exempt = self._on_floor(self.field.distance(centres[..., self.floor, :]), centres)
+                cost = cost.masked_fill(exempt, 0.0)
+                gradient = gradient.masked_fill(exempt.unsqueeze(-1), 0.0)
         else:
-            distance, gradient = self.field.distance_and_gradient(centres)
-            distance, gradient = distance.detach(), gradient.detach()
-            cost, slope = hinge_cost(distance - radii, self.eps)
-            exempt = self._on_floor(distance, centres, gradient)
-            cost, slope = cost.masked_fill(exempt, 0.0), slope.masked_fill(exempt, 0.0)
+            clearance = self.clearance(centres, radii)
+            near = ~(clearance >= self.eps)  # NaN included
+            gradient = torch.zeros_like(centres)
+            # Most spheres are far from anything, and gradients cost more than distances.
+            gradient[near] = self.field.distance_and_gradient(centres[near])[1].detach()
+            cost, slope = hinge_cost(clearance, self.eps)
             gradient = slope.unsqueeze(-1) * gradient
         unknown = self.unknown(centres)
         if unknown is not None:
@@ -122,25 +122,19 @@ class Workspace:
         return cost, gradient
 
     def _on_floor(
-        self,
-        distance: Float[Tensor, "*batch s"],
-        centres: Float[Tensor, "*batch s 3"],
-        gradient: Float[Tensor, "*batch s 3"] | None = None,
-        all_floor: bool = False,
+        self, floor_distance: Float[Tensor, "*batch floor"], centres: Float[Tensor, "*batch s 3"]
     ) -> Bool[Tensor, "*batch s"]:
-        """Which spheres may touch what is nearest to them because it is the floor.
+        """Which spheres may touch what is nearest to them because it is the floor; takes floor spheres'
+        distances.
 
         The distance alone would also excuse a wall that is nearly as near as the floor, up to the tolerance
         deep in the sphere; so the field must also increase upwards there.
         """
-        if self.floor is None:
-            return torch.zeros_like(distance, dtype=torch.bool)
-        candidates = (distance - centres[..., 2]).abs() <= self.config.floor_tolerance
-        if not all_floor:
-            candidates = candidates & self.floor
-        if gradient is not None:
-            return candidates & (gradient[..., 2] > MIN_FLOOR_SLOPE)
-        if candidates.any():
-            _, gradient = self.field.distance_and_gradient(centres[candidates])
-            candidates[candidates.clone()] = gradient[..., 2] > MIN_FLOOR_SLOPE
-        return candidates
+        centres_above = centres[..., self.floor, :]
+        exempt = (floor_distance - centres_above[..., 2]).abs() <= self.config.floor_tolerance
+        if exempt.any():
+            _, gradient = self.field.distance_and_gradient(centres_above[exempt])
+            exempt[exempt.clone()] = gradient[..., 2] > MIN_FLOOR_SLOPE
+        on_floor = torch.zeros(centres.shape[:-1], dtype=torch.bool)
+        on_floor[..., self.floor] = exempt
+        return on_floor
