@@ -100,7 +100,7 @@ def test_unusable_frames_are_passed_over_and_reported(sequence_dir) -> None:
     for index in (0, 3):
         Image.fromarray(np.zeros((60, 80), np.uint16)).save(sequence_dir / "depth" / f"{index:06d}.png")
     lines = (sequence_dir / "poses.txt").read_text().splitlines()
-    lines[6] = "5 " + " ".join(["nan"] * 16)
+    lines[6] = " ".join(["5", *["nan"] * 16])
     (sequence_dir / "poses.txt").write_text("\n".join(lines))
     mapper, report = run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 1, lambda _: None)
     assert sorted(report.frames_refused) == [0, 3, 5] and report.frames_used == 9 and mapper.frames_seen == 9
@@ -140,7 +140,7 @@ def test_map_then_query(sequence_dir, tmp_path, monkeypatch, capsys) -> None:
     assert report["steps"] == 96 and report["frames_used"] == 12
     assert len(trimesh.load(out / "mesh.ply").faces) == report["mesh_faces"] > 100
     assert Image.open(out / "slices.png").size[0] > 500
-    lines[6] = " ".join(["5", *["nan"] * 16])
+    points = np.random.default_rng(0).uniform(-1, 1, (100, 3)) + [0, 0, 1]
     np.save(tmp_path / "points.npy", points)
     run_cli(monkeypatch, "query", out, "--points", tmp_path / "points.npy", "--out", tmp_path / "answers.npz")
     answers = np.load(tmp_path / "answers.npz")
