@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
+from xml.etree import ElementTree
 
 import numpy as np
 import pybullet
 from jaxtyping import Float
+from torch import Tensor
 
 from robots.errors import RobotError, UnknownJointError, UnknownLinkError
 from robots.simulation.poses import link_frames, split_pose
+
+JointVector: TypeAlias = Sequence[float | int] | np.ndarray | Tensor
+"""One number for each controlled joint [rad | m] or [rad/s | m/s]."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,7 @@ class Articulation:
         root = pybullet.getBodyInfo(self.body, physicsClientId=client)[0].decode()
         self.link_index = {root: -1} | {j.link: j.index for j in self.joints.values()}
         self.link_names = {index: name for name, index in self.link_index.items()}
+        self._lighten_frames(Path(urdf_path))
         self._remove_passive_damping()
 
     def joint(self, name: str) -> Joint:
@@ -149,6 +156,19 @@ class Articulation:
                 velocity=max(0.0, info[11]),
             )
         return joints
+
+    def _lighten_frames(self, path: Path) -> None:
+        """Take the weight off links without inertia, which pybullet makes 1 kg with 1 kg m^2."""
+        for link in ElementTree.parse(path).getroot().findall("link"):
+            index = self.link_index.get(link.get("name", ""), -1)
+            if link.find("inertial") is None and index >= 0:
+                pybullet.changeDynamics(
+                    self.body,
+                    index,
+                    mass=1e-3,
+                    localInertiaDiagonal=[1e-6] * 3,
+                    physicsClientId=self.client,
+                )
 
     def _remove_passive_damping(self) -> None:
         """Leave friction to the motors: explicit joint damping is unstable on light links."""

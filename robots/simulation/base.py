@@ -43,7 +43,7 @@ class DifferentialDrive:
         """Turning rate now asked of the base [rad/s]."""
         self._command = (0.0, 0.0)
 
-    def command(self, v: float, omega: float) -> None:
+    def command(self, v: float | int, omega: float | int) -> None:
         """Set the wanted forward speed [m/s] and turning rate [rad/s]; values over the limits are clipped.
 
         Raises:

@@ -32,14 +32,14 @@ class PinholeCamera:
 
     @staticmethod
     def from_fov(
-        width: int = 160, height: int = 120, horizontal_fov: float = np.radians(58.0)
+        width: int = 160, height: int = 120, horizontal_fov: float = float(np.radians(58.0))
     ) -> PinholeCamera:
         """Square pixels and a centred principal point; the default is the view of an Xtion [rad]."""
         if not (0 < horizontal_fov < np.pi and width > 0 and height > 0):
             raise RobotError(
                 f"need 0 < fov < pi and a positive size, got {horizontal_fov}, {width} x {height}"
             )
-        f = width / 2 / np.tan(horizontal_fov / 2)
+        f = width / 2 / float(np.tan(horizontal_fov / 2))
         return PinholeCamera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
 
     def rays(self) -> Float[np.ndarray, "height width 3"]:
@@ -142,7 +142,8 @@ class DepthCamera:
         if self.world.time < self._next_time - 1e-9:
             return None
         # After a pause the rate starts anew: no burst of frames to catch up.
-        self._next_time = max(self._next_time + 1 / self.rate, self.world.time)
+        due = self._next_time + 1 / self.rate
+        self._next_time = due if due > self.world.time else self.world.time + 1 / self.rate
         return self.render()
 
     def _visible(self) -> Iterator[tuple[RayCaster, np.ndarray]]:

@@ -9,18 +9,22 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from robots.simulation.primitives import Primitive
+from robots.simulation.poses import planar_pose
+from robots.simulation.primitives import Box, Cylinder, Primitive
 from robots.simulation.scene_sdf import SceneField
+
+HEADROOM = 1.5
+"""Solids that hang higher than this over the floor [m] are no obstacle to a base and what stands on it."""
 
 
 @dataclass(frozen=True)
 class FloorMap:
-    """Clearance of vertical columns over a grid of floor positions.
+    """Clearance of a vertical column over a grid of floor positions.
 
     Attributes:
         x: grid positions along x (nx,) [m].
         y: grid positions along y (ny,) [m].
-        clearance: distance from each column to the nearest solid (nx, ny) [m]; the floor does not count.
+        clearance: horizontal distance from each column to the nearest solid (nx, ny) [m].
     """
 
     x: np.ndarray
@@ -38,27 +42,34 @@ class FloorMap:
         return labels
 
 
-def column_clearance(
-    field: SceneField, positions: np.ndarray, height: float = 1.5, step: float = 0.1
-) -> np.ndarray:
-    """Distance [m] from vertical columns at floor positions (n, 2) to the nearest solid of the field.
-
-    The columns go from `step` to `height` [m]. Sampling at `step` overestimates a clearance d by at most
-    step**2 / (8 d): 2.5 mm at half a metre.
-    """
-    z = torch.arange(step, height + 1e-9, step, dtype=torch.float32)
-    xy = torch.as_tensor(positions, dtype=torch.float32)
-    columns = torch.cat((xy[:, None].expand(-1, len(z), 2), z[None, :, None].expand(len(xy), -1, 1)), dim=-1)
-    with torch.no_grad():
-        return field.distance(columns).amin(dim=-1).numpy()
-
-
 def floor_map(
     primitives: Iterable[Primitive], width: float, depth: float, resolution: float = 0.05
 ) -> FloorMap:
-    """Map the clearance over the floor |x| < width / 2, |y| < depth / 2 [m] of a scene without its floor."""
-    field = SceneField([p for p in primitives if p.name != "floor"])
+    """Map the clearance over the floor |x| < width / 2, |y| < depth / 2 [m].
+
+    What is below the floor or higher than `HEADROOM` does not count; all else counts at every height.
+    """
+    field = SceneField(_footprint(p) for p in primitives if _obstructs(p))
     x = np.arange(-width / 2 + resolution / 2, width / 2, resolution)
     y = np.arange(-depth / 2 + resolution / 2, depth / 2, resolution)
-    positions = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    return FloorMap(x, y, column_clearance(field, positions).reshape(len(x), len(y)))
+    points = np.stack((*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))), axis=-1)
+    clearance = field.distance(torch.as_tensor(points, dtype=torch.float32)).numpy()
+    return FloorMap(x, y, clearance)
+
+
+def _obstructs(solid: Primitive) -> bool:
+    low, high = solid.mesh().bounds[:, 2]
+    return bool(high > 1e-6 and low < HEADROOM)
+
+
+def _footprint(solid: Primitive) -> Primitive:
+    """Prism, far taller than any room, over what an upright solid covers of the floor."""
+    x, y = solid.pose[:2, 3]
+    if abs(solid.pose[2, 2]) > 1 - 1e-9:
+        if isinstance(solid, Box):
+            yaw = float(np.arctan2(solid.pose[1, 0], solid.pose[0, 0]))
+            return Box(solid.name, planar_pose(x, y, yaw=yaw), (*solid.size[:2], 100.0))
+        if isinstance(solid, Cylinder):
+            return Cylinder(solid.name, planar_pose(x, y), solid.radius, 100.0)
+    # A leaning solid stands on the shadow of its bounding ball; for a sphere that is exact.
+    return Cylinder(solid.name, planar_pose(x, y), solid.bounding_radius, 100.0)

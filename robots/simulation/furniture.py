@@ -46,7 +46,7 @@ def table(
         _box(f"{name}.leg{i}", (leg, leg, height - thickness), cx, cy, 0.0, colour)
         for i, (cx, cy) in enumerate(corners)
     ]
-    return (_box(f"{name}.top", (width, depth, thickness), 0, 0, height - thickness, colour), *legs)
+    return (_box(f"{name}.top", (width, depth, thickness), 0.0, 0.0, height - thickness, colour), *legs)
 
 
 def round_table(name: str, radius: float, height: float, colour: Colour = WOOD) -> Parts:
@@ -61,7 +61,7 @@ def round_table(name: str, radius: float, height: float, colour: Colour = WOOD) 
 def chair(name: str, colour: Colour = DARK_WOOD) -> Parts:
     """Build a chair of 0.42 x 0.42 m: seat at 0.45 m, back to 0.88 m on its +y side, four legs."""
     seat = table(name, 0.42, 0.42, 0.45, colour)
-    return (*seat, _box(f"{name}.back", (0.42, 0.04, 0.42), 0, 0.19, 0.46, colour))
+    return (*seat, _box(f"{name}.back", (0.42, 0.04, 0.42), 0.0, 0.19, 0.46, colour))
 
 
 def office_chair(name: str, colour: Colour = GREY) -> Parts:
@@ -70,7 +70,7 @@ def office_chair(name: str, colour: Colour = GREY) -> Parts:
         Cylinder(f"{name}.foot", planar_pose(0, 0, 0.04), 0.26, 0.06, colour=METAL),
         Cylinder(f"{name}.column", planar_pose(0, 0, 0.25), 0.035, 0.38, colour=METAL),
         Cylinder(f"{name}.seat", planar_pose(0, 0, 0.47), 0.24, 0.07, colour=colour),
-        _box(f"{name}.back", (0.4, 0.05, 0.5), 0, 0.22, 0.5, colour),
+        _box(f"{name}.back", (0.4, 0.05, 0.5), 0.0, 0.22, 0.5, colour),
     )
 
 
@@ -79,15 +79,15 @@ def shelf(
 ) -> Parts:
     """Build an open shelf: sides, a back and `boards` boards, the lowest 6 cm up and the highest on top."""
     side = 0.025
-    back = _box(f"{name}.back", (width, 0.015, height), 0, depth / 2 - 0.0075, 0, colour)
+    back = _box(f"{name}.back", (width, 0.015, height), 0.0, depth / 2.0 - 0.0075, 0.0, colour)
     sides = [
-        _box(f"{name}.side{i}", (side, depth, height), sx * (width - side) / 2, 0, 0, colour)
+        _box(f"{name}.side{i}", (side, depth, height), sx * (width - side) / 2.0, 0.0, 0.0, colour)
         for i, sx in enumerate((-1, 1))
     ]
     bottoms = np.linspace(0.06, height - side, boards)
     inner = width - 2 * side
     rows = [
-        _box(f"{name}.board{i}", (inner, depth, side), 0, 0, z, colour)
+        _box(f"{name}.board{i}", (inner, depth, side), 0.0, 0.0, z, colour)
         for i, z in enumerate(bottoms.tolist())
     ]
     return (back, *sides, *rows)
@@ -95,17 +95,17 @@ def shelf(
 
 def books(name: str, width: float, colour: Colour) -> Parts:
     """Build a row of books 0.24 m high with its own bottom at z = 0, for a shelf board."""
-    return (_box(name, (width, 0.18, 0.24), 0, 0, 0, colour),)
+    return (_box(name, (width, 0.18, 0.24), 0.0, 0.0, 0.0, colour),)
 
 
 def sofa(name: str, width: float = 1.9, colour: Colour = BLUE) -> Parts:
     """Build a sofa 0.85 m deep: base, two arm rests, and a back on its +y side."""
     arm = 0.18
     return (
-        _box(f"{name}.base", (width - 2 * arm, 0.85, 0.42), 0, 0, 0, colour),
-        _box(f"{name}.back", (width - 2 * arm, 0.2, 0.43), 0, 0.325, 0.42, colour),
+        _box(f"{name}.base", (width - 2.0 * arm, 0.85, 0.42), 0.0, 0.0, 0.0, colour),
+        _box(f"{name}.back", (width - 2.0 * arm, 0.2, 0.43), 0.0, 0.325, 0.42, colour),
         *[
-            _box(f"{name}.arm{i}", (arm, 0.85, 0.6), s * (width - arm) / 2, 0, 0, colour)
+            _box(f"{name}.arm{i}", (arm, 0.85, 0.6), s * (width - arm) / 2.0, 0.0, 0.0, colour)
             for i, s in enumerate((-1, 1))
         ],
     )
@@ -123,8 +123,8 @@ def cupboard(name: str, width: float, height: float, depth: float = 0.45, colour
         for i, s in enumerate((-1, 1))
     ]
     return (
-        _box(f"{name}.body", (width, depth, height - 0.08), 0, 0, 0.08, colour),
-        _box(f"{name}.plinth", (width - 0.04, depth - 0.08, 0.08), 0, 0.02, 0, GREY),
+        _box(f"{name}.body", (width, depth, height - 0.08), 0.0, 0.0, 0.08, colour),
+        _box(f"{name}.plinth", (width - 0.04, depth - 0.08, 0.08), 0.0, 0.02, 0.0, GREY),
         *knobs,
     )
 
@@ -132,9 +132,9 @@ def cupboard(name: str, width: float, height: float, depth: float = 0.45, colour
 def counter(name: str, width: float, colour: Colour = WHITE) -> Parts:
     """Build a kitchen counter 0.6 m deep and 0.9 m high, with a tap and a hanging cupboard above."""
     return (
-        _box(f"{name}.body", (width, 0.58, 0.86), 0, 0.01, 0, colour),
-        _box(f"{name}.worktop", (width, 0.6, 0.04), 0, 0, 0.86, DARK_WOOD),
-        _box(f"{name}.hanging", (width, 0.34, 0.6), 0, 0.13, 1.45, colour),
+        _box(f"{name}.body", (width, 0.58, 0.86), 0.0, 0.01, 0.0, colour),
+        _box(f"{name}.worktop", (width, 0.6, 0.04), 0.0, 0.0, 0.86, DARK_WOOD),
+        _box(f"{name}.hanging", (width, 0.34, 0.6), 0.0, 0.13, 1.45, colour),
         Cylinder(f"{name}.tap", planar_pose(0.25 * width, 0.18, 1.02), 0.018, 0.24, colour=METAL),
     )
 
@@ -160,27 +160,27 @@ def plant(name: str) -> Parts:
 def monitor(name: str) -> Parts:
     """Build a screen on a foot with its own bottom at z = 0, looking towards -y, for a desk top."""
     return (
-        _box(f"{name}.foot", (0.2, 0.16, 0.02), 0, 0, 0, GREY),
-        _box(f"{name}.neck", (0.04, 0.03, 0.14), 0, 0.03, 0.02, GREY),
-        _box(f"{name}.screen", (0.55, 0.03, 0.32), 0, 0, 0.12, (0.12, 0.12, 0.14)),
+        _box(f"{name}.foot", (0.2, 0.16, 0.02), 0.0, 0.0, 0.0, GREY),
+        _box(f"{name}.neck", (0.04, 0.03, 0.14), 0.0, 0.03, 0.02, GREY),
+        _box(f"{name}.screen", (0.55, 0.03, 0.32), 0.0, 0.0, 0.12, (0.12, 0.12, 0.14)),
     )
 
 
 def television(name: str) -> Parts:
     """Build a low board with a large screen standing on it, looking towards -y."""
     return (
-        _box(f"{name}.board", (1.6, 0.4, 0.45), 0, 0, 0, DARK_WOOD),
-        _box(f"{name}.foot", (0.5, 0.2, 0.04), 0, 0, 0.45, GREY),
-        _box(f"{name}.screen", (1.15, 0.05, 0.66), 0, 0, 0.49, (0.1, 0.1, 0.12)),
+        _box(f"{name}.board", (1.6, 0.4, 0.45), 0.0, 0.0, 0.0, DARK_WOOD),
+        _box(f"{name}.foot", (0.5, 0.2, 0.04), 0.0, 0.0, 0.45, GREY),
+        _box(f"{name}.screen", (1.15, 0.05, 0.66), 0.0, 0.0, 0.49, (0.1, 0.1, 0.12)),
     )
 
 
 def bed(name: str) -> Parts:
     """Build a bed of 1.4 x 2 m whose head end is on its +y side."""
     return (
-        _box(f"{name}.frame", (1.4, 2.0, 0.28), 0, 0, 0.04, WOOD),
-        _box(f"{name}.mattress", (1.34, 1.94, 0.18), 0, 0, 0.32, WHITE),
-        _box(f"{name}.head", (1.4, 0.06, 0.95), 0, 1.03, 0.0, WOOD),
+        _box(f"{name}.frame", (1.4, 2.0, 0.28), 0.0, 0.0, 0.04, WOOD),
+        _box(f"{name}.mattress", (1.34, 1.94, 0.18), 0.0, 0.0, 0.32, WHITE),
+        _box(f"{name}.head", (1.4, 0.06, 0.95), 0.0, 1.03, 0.0, WOOD),
         _box(f"{name}.pillow", (0.6, 0.35, 0.1), -0.3, 0.72, 0.5, BLUE),
     )
 
@@ -192,8 +192,8 @@ def room_shell(width: float, depth: float, height: float = 2.6, thickness: float
     grey: Colour = (0.86, 0.85, 0.82)
     return (
         Box("floor", planar_pose(0, 0, -t / 2), (width + 2 * t, depth + 2 * t, t), colour=(0.6, 0.52, 0.44)),
-        _box("wall.west", (t, depth + 2 * t, height), -x, 0, 0, grey),
-        _box("wall.east", (t, depth + 2 * t, height), x, 0, 0, grey),
-        _box("wall.south", (width, t, height), 0, -y, 0, grey),
-        _box("wall.north", (width, t, height), 0, y, 0, grey),
+        _box("wall.west", (t, depth + 2.0 * t, height), -x, 0.0, 0.0, grey),
+        _box("wall.east", (t, depth + 2.0 * t, height), x, 0.0, 0.0, grey),
+        _box("wall.south", (width, t, height), 0.0, -y, 0.0, grey),
+        _box("wall.north", (width, t, height), 0.0, y, 0.0, grey),
     )

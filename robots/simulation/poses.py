@@ -9,7 +9,7 @@ import pybullet
 from scipy.spatial.transform import Rotation
 
 
-def planar_pose(x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> np.ndarray:
+def planar_pose(x: float | int, y: float | int, z: float | int = 0.0, yaw: float | int = 0.0) -> np.ndarray:
     """Pose (4, 4) at (x, y, z) [m] turned about the vertical by `yaw` [rad]."""
     pose = np.eye(4)
     c, s = np.cos(yaw), np.sin(yaw)

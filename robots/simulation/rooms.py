@@ -84,7 +84,7 @@ class Layout:
         for i, (x, y, yaw) in enumerate(places):
             pose = table @ planar_pose(x, y, yaw=yaw) @ planar_pose(0, self.rng.uniform(0, 0.08))
             heading = float(np.arctan2(pose[1, 0], pose[0, 0]))
-            self.put(fn.chair(f"{name}{i}"), pose[0, 3], pose[1, 3], heading, shift=0.02, turn=8)
+            self.put(fn.chair(f"{name}{i}"), pose[0, 3], pose[1, 3], heading, shift=0.02, turn=8.0)
 
     def put_grasp_table(self, along: float, wall: str) -> None:
         """Put the grasp table by a wall with one object to grasp near its edge and two behind it."""
@@ -146,8 +146,8 @@ def _apartment(layout: Layout) -> None:
     layout.drop(dining, 0.74, bowl("fruit_bowl"), 0.1, 0.05)
     layout.drop(dining, 0.74, parcel("dining_parcel"), -0.35, -0.1)
     by_wall(fn.television("television"), 0.0, "west", 0.4)
-    put(fn.sofa("sofa"), -1.15, 0.0, -QUARTER)
-    coffee = put(fn.table("coffee_table", 0.9, 0.5, 0.42, fn.DARK_WOOD), -2.3, 0.0, QUARTER)
+    put(fn.sofa("sofa"), -1.05, 0.0, -QUARTER)
+    coffee = put(fn.table("coffee_table", 0.9, 0.5, 0.42, fn.DARK_WOOD), -2.2, 0.0, QUARTER)
     layout.drop(coffee, 0.42, parcel("coffee_parcel"), 0.15, 0.05)
     shelf = by_wall(fn.shelf("shelf", 1.4, 1.8, boards=5), -2.3, "north", 0.32)
     _fill_shelf(layout, "shelf", shelf, [0.085, 0.51, 0.94, 1.37], 1.3)
@@ -165,8 +165,8 @@ def _office(layout: Layout) -> None:
         desk = by_wall(fn.table(f"desk{i}", 1.5, 0.72, 0.74, fn.WHITE), y, "west", 0.72)
         layout.put_on(desk, 0.74, fn.monitor(f"monitor{i}"), 0.1, 0.15)
         layout.drop(desk, 0.74, can(f"desk_can{i}"), -0.5, 0.0)
-        put(fn.office_chair(f"office_chair{i}"), -2.95, y, -QUARTER, turn=20)
-    meeting = put(fn.table("meeting_table", 2.0, 1.0, 0.74, fn.DARK_WOOD), 1.4, 0.35)
+        put(fn.office_chair(f"office_chair{i}"), -2.95, y, -QUARTER, turn=20.0)
+    meeting = put(fn.table("meeting_table", 2.0, 1.0, 0.74, fn.DARK_WOOD), 1.25, 0.35)
     south, north = (-0.62, np.pi), (0.62, 0.0)
     places = [(x, *side) for side in (south, north) for x in (-0.65, 0.0, 0.65)]
     layout.put_chairs("meeting_chair", meeting, places)
@@ -175,9 +175,9 @@ def _office(layout: Layout) -> None:
     for i, x in enumerate((-0.9, 0.4)):
         case = by_wall(fn.shelf(f"bookcase{i}", 1.2, 2.0, boards=6), x, "north", 0.32)
         _fill_shelf(layout, f"bookcase{i}", case, [0.085, 0.468, 0.851, 1.234], 1.1)
-    put((Box("partition", planar_pose(0, 0, 0.75), (1.8, 0.06, 1.5), colour=fn.BLUE),), -1.15, -0.9, QUARTER)
+    put((Box("partition", planar_pose(0, 0, 0.75), (1.8, 0.06, 1.5), colour=fn.BLUE),), -1.15, -0.82, QUARTER)
     put((Cylinder("pillar", planar_pose(0, 0, 1.3), 0.2, 2.6, colour=fn.WHITE),), -1.15, 0.75)
-    by_wall(fn.sofa("sofa", 1.8, fn.GREEN), 0.5, "south", 0.85)
+    by_wall(fn.sofa("sofa", 1.8, fn.GREEN), 0.9, "south", 0.85)
     cupboard = by_wall(fn.cupboard("filing", 1.6, 1.1), 1.0, "east", 0.48)
     printer = Box("printer", planar_pose(0, 0, 0.15), (0.45, 0.38, 0.3), colour=fn.GREY)
     layout.put_on(cupboard, 1.1, (printer,), 0.3, 0.0)
@@ -197,7 +197,7 @@ def _flat(layout: Layout) -> None:
         layout.static.append(wall)
     by_wall(fn.sofa("sofa", 1.8, fn.RED), 0.7, "west", 0.85)
     dining = put(fn.round_table("dining_table", 0.5, 0.74), -1.2, 0.1)
-    layout.put_chairs("chair", dining, [(0, 0.6, 0.0), (0, -0.6, np.pi)])
+    layout.put_chairs("chair", dining, [(0.0, 0.6, 0.0), (0.0, -0.6, np.pi)])
     layout.drop(dining, 0.74, bowl("fruit_bowl"), 0.05, 0.0)
     counter = by_wall(fn.counter("counter", 2.2), -2.5, "south", 0.6)
     layout.drop(counter, 0.9, can("counter_can"), 0.5, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,13 +18,13 @@ from robots.simulation.primitives import LOCAL_DISTANCE, LOCAL_GRADIENT, Primiti
 if TYPE_CHECKING:
     from robots.simulation.scenes import Scene
 
-CHUNK = 4096
+CHUNK = 1024
 """Points evaluated at once: small enough that points x primitives stays in the cache."""
 
 
 @dataclass(frozen=True)
 class _Group:
-    """All primitives of one kind, stacked; `rotation` is (3, 3 n) so that one product turns all points."""
+    """All primitives of one kind, stacked with the components first: rotation (3, 3, n), the others (3, n)."""
 
     kind: str
     rotation: Tensor
@@ -36,20 +37,53 @@ class _Group:
         rotation = poses[:, :3, :3]
         offset = torch.einsum("nij,ni->nj", rotation, poses[:, :3, 3])
         parameters = torch.tensor([m.parameters for m in members], dtype=torch.float64)
-        stacked = rotation.permute(1, 0, 2).reshape(3, -1)
-        return _Group(kind, stacked.to(dtype), offset.to(dtype), parameters.to(dtype))
+        # rotation[a, b, i] = R_i[b, a]: local component a of solid i from world component b.
+        stacked = rotation.permute(2, 1, 0).contiguous()
+        return _Group(
+            kind, stacked.to(dtype), offset.T.contiguous().to(dtype), parameters.T.contiguous().to(dtype)
+        )
 
     def nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Smallest distance (n,) over the group and which member has it (n,)."""
-        local = (points @ self.rotation).view(len(points), -1, 3) - self.offset
-        nearest = LOCAL_DISTANCE[self.kind](local, self.parameters).min(dim=1)
+        turn = self.rotation.transpose(1, 2).reshape(-1, 3)
+        local = torch.addmm(-self.offset.reshape(-1, 1), turn, points.T).view(3, -1, len(points))
+        nearest = _COMPONENT_DISTANCE[self.kind](local, self.parameters[..., None]).min(dim=0)
         return nearest.values, nearest.indices
 
     def of_member(self, points: Tensor, member: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Points in the frames of the given members, those frames' rotations and parameters."""
-        rotation = self.rotation.view(3, -1, 3)[:, member].permute(1, 0, 2)
-        local = torch.einsum("pi,pij->pj", points, rotation) - self.offset[member]
-        return local, rotation, self.parameters[member]
+        rotation = self.rotation[:, :, member].permute(2, 1, 0)
+        local = torch.einsum("pi,pij->pj", points, rotation) - self.offset[:, member].T
+        return local, rotation, self.parameters[:, member].T
+
+
+def _corner(*q: Tensor) -> Tensor:
+    """Distance to the region where all components q are negative; overwrites them."""
+    inside = reduce(torch.maximum, q).clamp_(max=0)
+    squares = [component.clamp_(min=0).square_() for component in q]
+    return reduce(Tensor.add_, squares).sqrt_().add_(inside)
+
+
+def _box_components(local: Tensor, parameters: Tensor) -> Tensor:
+    return _corner(*local.abs_().sub_(parameters))
+
+
+def _cylinder_components(local: Tensor, parameters: Tensor) -> Tensor:
+    radial = torch.hypot(local[0], local[1]).sub_(parameters[0])
+    return _corner(radial, local[2].abs_().sub_(parameters[1]))
+
+
+def _sphere_components(local: Tensor, parameters: Tensor) -> Tensor:
+    return local.square_().sum(dim=0).sqrt_().sub_(parameters[0])
+
+
+# As LOCAL_DISTANCE, but for points with their components first (3, n, points), which they overwrite: three
+# to four times as fast, and where nearly all the time of a query goes.
+_COMPONENT_DISTANCE = {
+    "box": _box_components,
+    "cylinder": _cylinder_components,
+    "sphere": _sphere_components,
+}
 
 
 class SceneField:

@@ -5,26 +5,38 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pybullet
 from jaxtyping import Float
 
 from robots.errors import RobotError
-from robots.simulation.articulation import Articulation, Joint
+from robots.simulation.articulation import Articulation, Joint, JointVector
 from robots.simulation.base import DifferentialDrive, DriveConfig, planar_velocity
 
 BASE_JOINTS = ("base_x", "base_y", "base_yaw")
 
 
+@runtime_checkable
 class GripperModel(Protocol):
     """What the simulator needs to know of a gripper; `robots.model` has one."""
 
-    joint_names: tuple[str, ...]
-    open_position: float
-    closed_position: float
-    max_force: float
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints of the fingers."""
+
+    @property
+    def open_position(self) -> tuple[float, ...]:
+        """Position of each of the joints when open [m | rad]."""
+
+    @property
+    def closed_position(self) -> tuple[float, ...]:
+        """Position of each of the joints when closed [m | rad]."""
+
+    @property
+    def max_force(self) -> float:
+        """Largest force of each finger [N]."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +84,7 @@ class SimulatedRobot(Articulation):
         client: int,
         urdf_path: str | Path,
         joint_names: Sequence[str],
-        q: Sequence[float] | np.ndarray,
+        q: JointVector,
         *,
         gripper: GripperModel | None = None,
         head_joints: Sequence[str] = (),
@@ -97,7 +109,7 @@ class SimulatedRobot(Articulation):
         if gripper:
             self._prepare_fingers(gripper)
 
-    def reset(self, q: Sequence[float] | np.ndarray) -> None:
+    def reset(self, q: JointVector) -> None:
         """Put the joints at `q` (dof,) [rad | m] at rest, outside of physics, and hold them there.
 
         Raises:
@@ -115,9 +127,7 @@ class SimulatedRobot(Articulation):
         states = pybullet.getJointStates(self.body, self._indices, physicsClientId=self.client)
         return np.array([s[0] for s in states]), np.array([s[1] for s in states])
 
-    def command_joints(
-        self, q: Sequence[float] | np.ndarray, qdot: Sequence[float] | np.ndarray | None = None
-    ) -> None:
+    def command_joints(self, q: JointVector, qdot: JointVector | None = None) -> None:
         """Drive all controlled joints but the base to `q` (dof,), with feed-forward velocity `qdot` (dof,).
 
         Entries of the base joints are ignored: the base takes `command_base`. Effort and velocity limits
@@ -132,7 +142,7 @@ class SimulatedRobot(Articulation):
             if name in self._arm:
                 self._hold(name, position, velocity)
 
-    def command_joint_velocities(self, qdot: Sequence[float] | np.ndarray) -> None:
+    def command_joint_velocities(self, qdot: JointVector) -> None:
         """Drive all controlled joints but the base with velocities `qdot` (dof,) [rad/s | m/s].
 
         Raises:
@@ -142,7 +152,7 @@ class SimulatedRobot(Articulation):
             if name in self._arm:
                 self._set_speed(name, velocity)
 
-    def command_base(self, v: float, omega: float) -> None:
+    def command_base(self, v: float | int, omega: float | int) -> None:
         """Ask the base for forward speed `v` [m/s] and turning rate `omega` [rad/s].
 
         Raises:
@@ -152,7 +162,7 @@ class SimulatedRobot(Articulation):
             raise RobotError(f"the robot has no base: joint_names must contain {BASE_JOINTS}")
         self.drive.command(v, omega)
 
-    def command_gripper(self, opening: float, force: float | None = None) -> None:
+    def command_gripper(self, opening: float | int, force: float | int | None = None) -> None:
         """Move the fingers to `opening` in [0 closed, 1 open] with at most `force` [N], by default all of it.
 
         Raises:
@@ -164,11 +174,10 @@ class SimulatedRobot(Articulation):
         force = grip.max_force if force is None else force
         if not (0 <= opening <= 1 and force >= 0):
             raise RobotError(f"need opening in [0, 1] and force >= 0 [N], got {opening} and {force}")
-        position = grip.closed_position + opening * (grip.open_position - grip.closed_position)
-        for name in grip.joint_names:
-            self._hold(name, position, 0.0, force)
+        for name, low, high in zip(grip.joint_names, grip.closed_position, grip.open_position, strict=True):
+            self._hold(name, low + opening * (high - low), 0.0, float(force))
 
-    def command_head(self, pan: float, tilt: float) -> None:
+    def command_head(self, pan: float | int, tilt: float | int) -> None:
         """Turn the head to `pan` and `tilt` [rad].
 
         Raises:
@@ -201,7 +210,7 @@ class SimulatedRobot(Articulation):
                 carried.add(joint.index)
         return sorted(carried)
 
-    def _checked(self, vector: Sequence[float] | np.ndarray, name: str) -> np.ndarray:
+    def _checked(self, vector: JointVector, name: str) -> np.ndarray:
         array = np.asarray(vector, dtype=np.float64)
         if array.shape != (len(self.joint_names),) or not np.isfinite(array).all():
             raise RobotError(
@@ -260,14 +269,15 @@ class SimulatedRobot(Articulation):
                 frictionAnchor=True,
                 physicsClientId=self.client,
             )
-            pybullet.resetJointState(
-                self.body, finger.index, gripper.open_position, physicsClientId=self.client
-            )
-        if len(fingers) == 2:
-            self._couple(fingers[0], fingers[1], gripper.max_force)
+        for finger, position in zip(fingers, gripper.open_position, strict=True):
+            pybullet.resetJointState(self.body, finger.index, position, physicsClientId=self.client)
+        low, high = np.array(gripper.closed_position), np.array(gripper.open_position)
+        if len(fingers) == 2 and np.isclose(low[0] * high[1], low[1] * high[0]):
+            ratio = float((high - low)[0] / (high - low)[1])
+            self._couple(fingers[0], fingers[1], ratio, gripper.max_force)
         self.command_gripper(1.0)
 
-    def _couple(self, first: Joint, second: Joint, force: float) -> None:
+    def _couple(self, first: Joint, second: Joint, ratio: float, force: float) -> None:
         """Gear two fingers together: two equal motors alone would let the object slide sideways."""
         gear = pybullet.createConstraint(
             self.body,
@@ -280,6 +290,7 @@ class SimulatedRobot(Articulation):
             childFramePosition=[0, 0, 0],
             physicsClientId=self.client,
         )
+        # The constraint keeps first + gearRatio * second at zero.
         pybullet.changeConstraint(
-            gear, gearRatio=-1, erp=0.1, maxForce=2 * force, physicsClientId=self.client
+            gear, gearRatio=-ratio, erp=0.1, maxForce=2 * force, physicsClientId=self.client
         )

@@ -11,6 +11,7 @@ import pybullet
 from jaxtyping import Float
 
 from robots.errors import RobotError, SceneError
+from robots.simulation.articulation import JointVector
 from robots.simulation.base import DriveConfig
 from robots.simulation.contacts import Contact, robot_contacts
 from robots.simulation.poses import pose_matrix, split_pose
@@ -87,7 +88,7 @@ class World:
         self,
         urdf_path: str | Path,
         joint_names: Sequence[str],
-        q: Sequence[float] | np.ndarray,
+        q: JointVector,
         *,
         gripper: GripperModel | None = None,
         head_joints: Sequence[str] = (),
@@ -121,7 +122,7 @@ class World:
         self._let_base_hover()
         return self._robot
 
-    def step(self, duration: float | None = None) -> None:
+    def step(self, duration: float | int | None = None) -> None:
         """Advance physics by `duration` [s], rounded to whole physics steps; by one step if None."""
         steps = 1 if duration is None else max(1, round(duration / self.timestep))
         self._contacts = {}
@@ -137,25 +138,23 @@ class World:
         """Joint positions [rad | m] and velocities of the robot, in the order of its `joint_names`."""
         return self.robot.state()
 
-    def command_joints(
-        self, q: Sequence[float] | np.ndarray, qdot: Sequence[float] | np.ndarray | None = None
-    ) -> None:
+    def command_joints(self, q: JointVector, qdot: JointVector | None = None) -> None:
         """Drive the robot's joints but the base to `q` with feed-forward `qdot`; see `SimulatedRobot`."""
         self.robot.command_joints(q, qdot)
 
-    def command_joint_velocities(self, qdot: Sequence[float] | np.ndarray) -> None:
+    def command_joint_velocities(self, qdot: JointVector) -> None:
         """Drive the robot's joints but the base with velocities `qdot` (dof,) [rad/s | m/s]."""
         self.robot.command_joint_velocities(qdot)
 
-    def command_base(self, v: float, omega: float) -> None:
+    def command_base(self, v: float | int, omega: float | int) -> None:
         """Ask the base for forward speed `v` [m/s] and turning rate `omega` [rad/s]."""
         self.robot.command_base(v, omega)
 
-    def command_gripper(self, opening: float, force: float | None = None) -> None:
+    def command_gripper(self, opening: float | int, force: float | int | None = None) -> None:
         """Move the gripper to `opening` in [0 closed, 1 open] with at most `force` [N]."""
         self.robot.command_gripper(opening, force)
 
-    def command_head(self, pan: float, tilt: float) -> None:
+    def command_head(self, pan: float | int, tilt: float | int) -> None:
         """Turn the head to `pan` and `tilt` [rad]."""
         self.robot.command_head(pan, tilt)
 
