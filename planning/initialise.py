@@ -55,7 +55,7 @@ class RrtConfig:
     resolution: float = 0.02
     unlimited_range: float = 3.0
     goal_bias: float = 0.1
-    shortcut_rounds: int = 40
+    shortcut_rounds: int = 60
     max_nodes: int = 20_000
     seconds: float = 10.0
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
@@ -169,7 +169,6 @@ class StateSpace:
 
     def free(self, q: Float[Tensor, "k dof"]) -> Bool[Tensor, " k"]:
         """Which configurations keep limits and margins, in known space; NaN in the field is not free."""
-        config = self.config
         with torch.no_grad():
             centres, radii = self.robot.spheres(q)
         free = (self.workspace.clearance(centres, radii) >= self.margin).all(dim=-1) & within_limits(
@@ -178,10 +177,11 @@ class StateSpace:
         unknown = self.workspace.unknown(centres)
         if unknown is not None:
             free &= ~unknown.any(dim=-1)
-        if isinstance(self.robot, SelfCollidingRobot) and len(self.robot.self_collision_pairs):
+        if free.any() and isinstance(self.robot, SelfCollidingRobot) and len(self.robot.self_collision_pairs):
             first, second = self.robot.self_collision_pairs.unbind(dim=1)
+            centres = centres[free]
             gap = (centres[:, first] - centres[:, second]).norm(dim=-1) - radii[first] - radii[second]
-            free &= (gap >= config.self_margin).all(dim=-1)
+            free[free.clone()] = (gap >= self.config.self_margin).all(dim=-1)
         return free
 
     def advance(self, start: Float[Tensor, "k dof"], end: Float[Tensor, "k dof"]) -> Float[Tensor, " k"]:
@@ -296,19 +296,20 @@ def shortcut(
         if len(path) == 2 or time.perf_counter() > deadline:
             break
         arc = torch.cat([path.new_zeros(1), space.length(path.diff(dim=0)).cumsum(0)])
-        anywhere = torch.rand(12, 2, generator=generator).to(arc) * arc[-1]
-        vertices = arc[torch.randint(len(arc), (12, 2), generator=generator)]
+        anywhere = torch.rand(5, 2, generator=generator).to(arc) * arc[-1]
+        vertices = arc[torch.randint(len(arc), (5, 2), generator=generator)]
         ends = torch.cat([anywhere, vertices]).sort(dim=1).values
         segment = torch.searchsorted(arc, ends, right=True).clamp_max(len(arc) - 1) - 1
         weight = ((ends - arc[segment]) / (arc[segment + 1] - arc[segment]).clamp_min(1e-12)).clamp(0, 1)
         points = torch.lerp(path[segment], path[segment + 1], weight.unsqueeze(-1))
         saved = (ends[:, 1] - ends[:, 0]) - space.length(points[:, 1] - points[:, 0])
-        useful = saved > 1e-6
-        if not useful.any():
+        useful = (saved > 1e-6).nonzero()[:, 0]
+        if len(useful) == 0:
             continue
+        segment, points, saved = segment[useful], points[useful], saved[useful]
         saved = torch.where(space.advance(points[:, 0], points[:, 1]) == 1, saved, -torch.inf)
         best = int(saved.argmax())
-        if saved[best] > 1e-6:
+        if torch.isfinite(saved[best]):
             first, last = segment[best].tolist()
             path = torch.cat([path[: first + 1], points[best], path[last + 1 :]])
             distinct = torch.cat([torch.tensor([True]), space.length(path.diff(dim=0)) > 0])

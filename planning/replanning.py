@@ -1,0 +1,347 @@
+"""The closed loop: sense, map, plan, follow, and plan again when the map changes what the plan is worth.
+
+It knows a robot, a map and a world only by the Protocols here and in `planning.protocols`.
+"""
+
+from __future__ import annotations
+
+import enum
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from planning.chomp import ChompConfig
+from planning.clock import Clock, MeasuredClock, OnlineMap
+from planning.errors import ConfigError
+from planning.initialise import RrtConfig
+from planning.plan import Planner, PlannerConfig
+from planning.protocols import DistanceField, SphereRobot
+from planning.result import PlanResult
+from planning.tracking import BaseTracker, TrackerConfig
+from planning.trajectory import Trajectory
+from planning.validation import ValidationConfig, check
+
+logger = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class MobileRobot(Protocol):
+    """The robot and its world, real or simulated: it senses, drives, and lets time pass."""
+
+    @property
+    def time(self) -> float:
+        """Now [s]."""
+        ...
+
+    def base_state(self) -> Float[ndarray, "3"]:
+        """x, y [m] and yaw [rad] of the base."""
+        ...
+
+    def observe(self) -> Any | None:
+        """The newest depth frame, without the robot's own body; None if there is no new one."""
+        ...
+
+    def look_at(self, point: Float[ndarray, "3"]) -> None:
+        """Turn the camera towards a world point [m] as far as it goes."""
+        ...
+
+    def drive(self, v: float, omega: float, duration: float) -> None:
+        """Drive at v [m/s] and omega [rad/s] for some time [s]."""
+        ...
+
+
+@dataclass(frozen=True)
+class ReplanningConfig:
+    """How the loop drives.
+
+    Args:
+        planner: the path planner; its margins are set by the loop.
+        tracker: the base controller.
+        margin: clearance [m] that plans keep where start and goal allow it.
+        least_margin: clearance [m] of start or goal below which they count as blocked. Negative, because a map
+            still being learned is some centimetres wrong and the robot stands where it stands.
+        clearance_change: a plan is made anew when the map has taken this much [m] of its clearance.
+        scan: angle [rad] turned on the spot at the start, to see what is around.
+        look_ahead: distance along the path [m] at which the camera looks.
+        patience: plans in a row that may fail before the goal is called unreachable.
+        time_limit: [s] of the robot's time.
+    """
+
+    planner: PlannerConfig = field(
+        default_factory=lambda: PlannerConfig(
+            num_waypoints=40,
+            chomp=ChompConfig(eps=0.35, max_iterations=120),
+            rrt=RrtConfig(seconds=3.0),
+        )
+    )
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    margin: float = 0.05
+    least_margin: float = -0.10
+    clearance_change: float = 0.05
+    scan: float = 2 * math.pi
+    look_ahead: float = 1.5
+    patience: int = 20
+    time_limit: float = 180.0
+
+    def __post_init__(self) -> None:
+        if self.least_margin > self.margin or self.clearance_change <= 0 or self.time_limit <= 0:
+            raise ConfigError(
+                "ReplanningConfig: least_margin <= margin, clearance_change > 0 and time_limit > 0 are needed, got "
+                f"{self.least_margin:g}, {self.margin:g}, {self.clearance_change:g} m and {self.time_limit:g} s."
+            )
+
+
+class DriveStatus(enum.Enum):
+    """How a drive ended."""
+
+    REACHED = "reached"
+    UNREACHABLE = "unreachable"
+    TIME_LIMIT = "time limit"
+
+
+@dataclass
+class DriveReport:
+    """What happened on a drive. Times in seconds, lengths in metres."""
+
+    status: DriveStatus = DriveStatus.TIME_LIMIT
+    message: str = ""
+    duration: float = 0.0
+    path_length: float = 0.0
+    goal_distance: float = math.inf
+    rounds: int = 0
+    plans: int = 0
+    failed_plans: int = 0
+    frames: int = 0
+    frames_refused: int = 0
+    mapping_seconds: float = 0.0
+    planning_seconds: float = 0.0
+    slowest_plan: float = 0.0
+
+    @property
+    def success(self) -> bool:
+        """True if the goal was reached."""
+        return self.status is DriveStatus.REACHED
+
+
+class ReplanningLoop:
+    """Drives a differential base through a world that is mapped on the way.
+
+    While the computer maps and plans, the robot goes on with its last plan for as long as that takes.
+
+    Args:
+        robot: senses and drives.
+        body: the spheres to keep clear, with q = (x, y); it must be clear at every heading, since the base turns on
+            the spot.
+        mapper: learns from the frames.
+        snapshot: gives the field to plan in; called once a round, and charged to planning.
+        config: see `ReplanningConfig`.
+        clock: what computing costs.
+        watch: called with the loop after every round, for pictures.
+        seed: of the path search.
+    """
+
+    def __init__(
+        self,
+        robot: MobileRobot,
+        body: SphereRobot,
+        mapper: OnlineMap,
+        snapshot: Callable[[], DistanceField],
+        config: ReplanningConfig | None = None,
+        clock: Clock | None = None,
+        watch: Callable[[ReplanningLoop], None] | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.robot, self.body, self.mapper, self.snapshot = robot, body, mapper, snapshot
+        self.config, self.clock = config or ReplanningConfig(), clock or MeasuredClock()
+        self.watch, self.seed = watch, seed
+        self.tracker = BaseTracker(self.config.tracker)
+        self.plan: PlanResult | None = None
+        self.field: DistanceField | None = None
+        self.report = DriveReport()
+        self._owed = 0.0
+        self._failures = 0
+
+    def drive_to(self, goal: Float[ndarray, "2"], final_yaw: float | None = None) -> DriveReport:
+        """Look around, then map, plan and drive until the goal is reached or given up.
+
+        Args:
+            goal: x, y [m].
+            final_yaw: heading to end with [rad]; any if None.
+        """
+        started, self.report, self.plan = self.robot.time, DriveReport(), None
+        self._scan()
+        self.tracker.reset()
+        while self.robot.time - started < self.config.time_limit:
+            spent = self._sense_and_map()
+            fresh, planning = self._plan_if_needed(goal)
+            self._follow(spent + planning, final_yaw)
+            self.plan = fresh
+            self.report.rounds += 1
+            if self.watch:
+                self.watch(self)
+            if self.plan is not None and self.tracker.finished:
+                self._end(DriveStatus.REACHED, "the base stands on the goal")
+                break
+            if self._failures > self.config.patience:
+                self._end(DriveStatus.UNREACHABLE, self.report.message)
+                break
+        else:
+            self._end(DriveStatus.TIME_LIMIT, f"not there after {self.config.time_limit:g} s; {self.report.message}")
+        self.robot.drive(0.0, 0.0, self.config.tracker.period)
+        self.report.duration = self.robot.time - started
+        self.report.goal_distance = float(np.linalg.norm(self.robot.base_state()[:2] - goal))
+        return self.report
+
+    def _scan(self) -> None:
+        """Turn on the spot and map what comes into view."""
+        rate = 0.6 * self.config.tracker.max_yaw_rate
+        turned = 0.0
+        while True:
+            spent = self._sense_and_map()
+            if turned >= self.config.scan:
+                return
+            self._ahead(self.robot.base_state())
+            self._pass_time(spent, lambda _: (0.0, rate))
+            turned += rate * spent
+            if self.watch:
+                self.watch(self)
+
+    def _sense_and_map(self) -> float:
+        """Give the newest frame to the map and train; returns the time it took."""
+
+        def integrate() -> None:
+            frame = self.robot.observe()
+            if frame is None:
+                return
+            try:
+                self.mapper.integrate(frame)
+                self.report.frames += 1
+            except ValueError as error:
+                logger.warning("frame passed over: %s", error)
+                self.report.frames_refused += 1
+
+        _, spent = self.clock.charge(integrate)
+        if self.report.frames > 0:
+            spent += self.clock.train(self.mapper)
+        self.report.mapping_seconds += spent
+        return spent
+
+    def _plan_if_needed(self, goal: Float[ndarray, "2"]) -> tuple[PlanResult | None, float]:
+        """The plan to follow from now on (None: stand), and the time it took to find out."""
+
+        def decide() -> PlanResult | None:
+            self.field = self.snapshot()
+            if self._still_good():
+                return self.plan
+            fresh = self._planned(goal)
+            self.report.plans += 1
+            self._failures = 0 if fresh.success else self._failures + 1
+            if fresh.success:
+                return fresh
+            self.report.failed_plans += 1
+            self.report.message = f"{fresh.status.value}: {fresh.message}"
+            logger.info("no plan: %s", self.report.message)
+            return None
+
+        plans = self.report.plans
+        plan, spent = self.clock.charge(decide)
+        self.report.planning_seconds += spent
+        if self.report.plans > plans:
+            self.report.slowest_plan = max(self.report.slowest_plan, spent)
+        return plan, spent
+
+    def _still_good(self) -> bool:
+        """Whether what is left of the plan keeps its clearance on the new map."""
+        if self.plan is None or self.field is None:
+            return False
+        left = self._remaining(self.plan.trajectory)
+        clearance = check(self.body, left, self.field, self.config.planner.chomp.validation).clearance
+        wanted = min(self.config.margin, self.plan.clearance) - self.config.clearance_change
+        return clearance >= max(wanted, self.config.least_margin)
+
+    def _planned(self, goal: Float[ndarray, "2"]) -> PlanResult:
+        assert self.field is not None
+        config = self.config
+        start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
+        end = torch.as_tensor(goal, dtype=torch.float32)
+        lenient = replace(config.planner.chomp.validation, margin=config.least_margin)
+        # Where start or goal are tight, the whole plan is held to what they have; its cost still seeks room.
+        margin = config.margin
+        for q in (start, end):
+            standing = check(self.body, Trajectory(q[None], torch.zeros(1)), self.field, lenient)
+            margin = min(margin, standing.clearance - 0.005)
+        margin = max(margin, config.least_margin)
+        planner = Planner(self.body, _with_margin(config.planner, margin, lenient), self.seed)
+        warm = None if self.plan is None else self._remaining(self.plan.trajectory)
+        if warm is not None and len(warm) > 2:
+            warm = Trajectory.through(warm.waypoints, config.planner.num_waypoints, config.planner.duration)
+        return planner.plan(start, end, self.field, warm)
+
+    def _remaining(self, trajectory: Trajectory) -> Trajectory:
+        """The part of a path ahead of the base, starting where the base stands."""
+        here = torch.as_tensor(self.robot.base_state()[:2], dtype=trajectory.waypoints.dtype)
+        nearest = int((trajectory.waypoints - here).norm(dim=1).argmin())
+        ahead = torch.cat([here[None], trajectory.waypoints[nearest + 1 :]])
+        return Trajectory.through(ahead)
+
+    def _follow(self, duration: float, final_yaw: float | None) -> None:
+        """Let time pass on the plan; without one, turn on the spot to see more."""
+        if self.plan is None:
+            rate = 0.5 * self.config.tracker.max_yaw_rate
+            self._ahead(self.robot.base_state())
+            self._pass_time(duration, lambda _: (0.0, rate))
+            return
+        path = self.plan.trajectory.waypoints.numpy().astype(float)
+
+        def command(state: ndarray) -> tuple[float, float]:
+            self._look_along(path, state)
+            return self.tracker.command(state, path, None, final_yaw)
+
+        self._pass_time(duration, command)
+
+    def _pass_time(self, duration: float, command: Callable[[ndarray], tuple[float, float]]) -> None:
+        """Drive for `duration` [s] in whole control periods; what is left over is owed to the next round."""
+        period = self.config.tracker.period
+        self._owed += duration
+        for _ in range(max(1, int(self._owed / period))):
+            before = self.robot.base_state()
+            self.robot.drive(*command(before), period)
+            self.report.path_length += float(np.linalg.norm(self.robot.base_state()[:2] - before[:2]))
+            self._owed -= period
+        self._owed = max(0.0, self._owed)
+
+    def _look_along(self, path: Float[ndarray, "n 2"], state: ndarray) -> None:
+        """Look at the floor where the path will lead, or ahead where it ends."""
+        nearest = int(np.linalg.norm(path - state[:2], axis=1).argmin())
+        along = np.r_[0.0, np.linalg.norm(np.diff(path[nearest:], axis=0), axis=1).cumsum()]
+        if along[-1] < 0.5:
+            self._ahead(state)
+            return
+        target = path[nearest + int(np.searchsorted(along, self.config.look_ahead).clip(0, len(along) - 1))]
+        self.robot.look_at(np.array([*target, 0.3]))
+
+    def _ahead(self, state: ndarray) -> None:
+        direction = np.array([math.cos(state[2]), math.sin(state[2])])
+        self.robot.look_at(np.array([*(state[:2] + self.config.look_ahead * direction), 0.3]))
+
+    def _end(self, status: DriveStatus, message: str) -> None:
+        self.report.status, self.report.message = status, message
+        logger.info("drive ended: %s (%s)", status.value, message)
+
+
+def _with_margin(planner: PlannerConfig, margin: float, validation: ValidationConfig) -> PlannerConfig:
+    """The planner held to another clearance [m]."""
+    return replace(
+        planner,
+        chomp=replace(planner.chomp, validation=replace(validation, margin=margin)),
+        rrt=replace(planner.rrt, margin=margin + 0.01, min_margin=margin),
+    )
+
+
