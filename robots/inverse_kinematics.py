@@ -20,7 +20,9 @@ class IkConfig:
     max_iterations: int = 100
     damping: float = 0.03  # [m, rad] residual scale below which steps are full Gauss-Newton steps
     max_step: float = 0.4  # [rad | m] of any joint in one iteration: the linearisation holds no further
-    restart_spread: float = 1.0  # [rad | m] of the first half of the restarts about the seed; the rest is uniform
+    restart_spread: float = (
+        1.0  # [rad | m] of the first half of the restarts about the seed; the rest is uniform
+    )
     length: float = 0.3  # [m] an orientation error of 1 rad weighs as much as a position error of this
 
 
@@ -77,7 +79,9 @@ def solve(
         raise RobotError(f"num_seeds is {num_seeds}, at least 1 start is needed")
     targets = T_world_tool.reshape(-1, 4, 4).to(q_seed)
     if q_seed.shape[-1] != robot.num_dofs:
-        raise RobotError(f"q_seed has {q_seed.shape[-1]} joints, expected {robot.num_dofs}: {robot.joint_names}")
+        raise RobotError(
+            f"q_seed has {q_seed.shape[-1]} joints, expected {robot.num_dofs}: {robot.joint_names}"
+        )
     home = q_seed.reshape(-1, robot.num_dofs).expand(len(targets), -1)
     moving = _columns(robot, joints)
     lower, upper = robot.joint_limits.to(q_seed).unbind(-1)
@@ -104,7 +108,9 @@ def _columns(robot: Robot, joints: Sequence[str] | None) -> Tensor:
     names = robot.joint_names if joints is None else tuple(joints)
     unknown = [name for name in names if name not in robot.joint_names]
     if unknown or not names:
-        raise UnknownJointError(f"cannot move joints {unknown or '(none given)'}; planned are {robot.joint_names}")
+        raise UnknownJointError(
+            f"cannot move joints {unknown or '(none given)'}; planned are {robot.joint_names}"
+        )
     return torch.tensor([robot.joint_names.index(name) for name in names])
 
 
@@ -160,7 +166,13 @@ def _descend(
 
 
 def _step(
-    residual: Tensor, jacobian: Tensor, q: Tensor, moving: Tensor, lower: Tensor, upper: Tensor, damping: Tensor
+    residual: Tensor,
+    jacobian: Tensor,
+    q: Tensor,
+    moving: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    damping: Tensor,
 ) -> Tensor:
     """Damped least-squares step (n, m) in which joints pushed against a limit do not take part."""
     gradient = (jacobian.transpose(-1, -2) @ residual[..., None]).squeeze(-1)
@@ -220,7 +232,10 @@ def _rotation_vector(rotation: Tensor) -> Tensor:
         ],
         dim=-1,
     )
-    sine, cosine = skew.norm(dim=-1, keepdim=True) / 2, (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)[:, None] / 2
+    sine, cosine = (
+        skew.norm(dim=-1, keepdim=True) / 2,
+        (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)[:, None] / 2,
+    )
     angle = torch.atan2(sine, cosine)
     # R + R^T = 2 cos I + 2 (1 - cos) a a^T: its largest column is parallel to the axis where sin vanishes.
     outer = (rotation + rotation.transpose(-1, -2)) / 2 - cosine[..., None] * torch.eye(3).to(rotation)

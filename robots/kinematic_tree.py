@@ -73,7 +73,9 @@ class KinematicTree:
         for joint in joints:
             for link in (joint.parent, joint.child):
                 if link not in links:
-                    raise UrdfError(f"{path}: joint {joint.name!r} refers to link {link!r}, which is not there")
+                    raise UrdfError(
+                        f"{path}: joint {joint.name!r} refers to link {link!r}, which is not there"
+                    )
         roots = [link for link in links if link not in children]
         if len(roots) != 1 or len(set(children)) != len(children):
             raise UrdfError(f"{path}: the links must form one tree; found {len(roots)} roots: {roots}")
@@ -200,7 +202,9 @@ def _parse_joint(element: ElementTree.Element, path: str | Path) -> Joint:
     follows = None
     if mimic is not None:
         follows = Mimic(
-            _attribute(mimic, "joint", path), float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
+            _attribute(mimic, "joint", path),
+            float(mimic.get("multiplier", 1.0)),
+            float(mimic.get("offset", 0.0)),
         )
     parent, child = (end.get("link", "") for end in ends if end is not None)
     origin = parse_origin(element.find("origin"))

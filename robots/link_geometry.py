@@ -40,9 +40,13 @@ def _piece(collision: ElementTree.Element, urdf: str | Path) -> trimesh.Trimesh:
     elif shape.tag == "box":
         piece = trimesh.creation.box(np.array(shape.get("size", "").split(), dtype=float))
     elif shape.tag == "cylinder":
-        piece = trimesh.creation.cylinder(float(shape.get("radius", 0)), float(shape.get("length", 0)), sections=48)
+        piece = trimesh.creation.cylinder(
+            float(shape.get("radius", 0)), float(shape.get("length", 0)), sections=48
+        )
     elif shape.tag == "sphere":
         piece = trimesh.creation.icosphere(subdivisions=3, radius=float(shape.get("radius", 0)))
     else:
-        raise UrdfError(f"{urdf}: collision geometry <{shape.tag}> is not supported (mesh, box, cylinder, sphere)")
+        raise UrdfError(
+            f"{urdf}: collision geometry <{shape.tag}> is not supported (mesh, box, cylinder, sphere)"
+        )
     return piece.apply_transform(parse_origin(collision.find("origin")))

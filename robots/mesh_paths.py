@@ -40,7 +40,9 @@ def resolve_mesh(uri: str, urdf_path: str | Path) -> Path:
         if candidate.is_file():
             return candidate
     places = ", ".join(str(candidate) for candidate in candidates)
-    raise UrdfError(f"{urdf_path}: mesh {uri!r} not found; looked for {places}. Set ROS_PACKAGE_PATH to its package")
+    raise UrdfError(
+        f"{urdf_path}: mesh {uri!r} not found; looked for {places}. Set ROS_PACKAGE_PATH to its package"
+    )
 
 
 def _package_candidates(name: str, urdf_path: Path) -> list[Path]:

@@ -279,7 +279,8 @@ class Robot:
                 f"q has shape {tuple(q.shape)}, expected (..., {self.num_dofs}) for {self.name!r}: {self._joints}"
             )
         if not torch.isfinite(q).all():
-            bad = [j for j, ok in zip(self._joints, torch.isfinite(q).reshape(-1, self.num_dofs).all(0)) if not ok]
+            finite = torch.isfinite(q).reshape(-1, self.num_dofs).all(0).tolist()
+            bad = [joint for joint, good in zip(self._joints, finite, strict=True) if not good]
             raise RobotError(f"q is NaN or infinite at joints {bad} of {self.name!r}; expected finite values")
         return q
 

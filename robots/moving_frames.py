@@ -23,7 +23,9 @@ class MovingFrames:
     """
 
     def __init__(self, tree: KinematicTree, joints: Sequence[str], held: Mapping[str, float]) -> None:
-        self._source: list[tuple[int, float, float]] = []  # column of q, multiplier, offset of each moving joint
+        self._source: list[
+            tuple[int, float, float]
+        ] = []  # column of q, multiplier, offset of each moving joint
         self._places: dict[str, tuple[int, np.ndarray]] = {tree.root: (0, np.eye(4))}
         robot = ElementTree.Element("robot", name="moving_frames")
         ElementTree.SubElement(robot, "link", name="frame_0")
@@ -79,7 +81,9 @@ def _source_of(joint: Joint, tree: KinematicTree, planned: Sequence[str]) -> tup
     return list(planned).index(joint.name), multiplier, offset
 
 
-def _append_joint(robot: ElementTree.Element, joint: Joint, parent: int, child: int, origin: np.ndarray) -> None:
+def _append_joint(
+    robot: ElementTree.Element, joint: Joint, parent: int, child: int, origin: np.ndarray
+) -> None:
     ElementTree.SubElement(robot, "link", name=f"frame_{child}")
     kind = "prismatic" if joint.kind == "prismatic" else "continuous"
     element = ElementTree.SubElement(robot, "joint", name=f"joint_{child}", type=kind)

@@ -67,7 +67,8 @@ def _load_tiago() -> Robot:
         tool_link="panda_hand_tcp",
         gripper=FRANKA_HAND,
         named={
-            name: dict(zip(("torso_lift_joint", *arm), values, strict=True)) for name, values in postures.items()
+            name: dict(zip(("torso_lift_joint", *arm), values, strict=True))
+            for name, values in postures.items()
         },
         rest=dict(zip(("torso_lift_joint", *arm), TIAGO_TUCKED, strict=True)),
         head_joints=("head_1_joint", "head_2_joint"),

@@ -28,7 +28,8 @@ class RobotFitConfig:
     coarse_size: float = 0.5  # [m] diagonal of the bounding box
     size_exponent: float = 0.75
     pair_samples: int = 10_000  # random configurations behind the never/always rule
-    never_margin: float = 0.02  # [m] a pair counts as never colliding only if it stays this far apart
+    near_samples: int = 100  # of these, the closest ones of a pair on which the real geometry is compared
+    never_margin: float = 0.01  # [m] a pair counts as never colliding only if it stays this far apart
     always_share: float = 0.95  # a pair in collision this often is an artefact of overlapping spheres
     seed: int = 0
 
@@ -65,8 +66,12 @@ def fit_robot(
     lowest = dict(lowest or {})
     unknown = (set(skip) | set(lowest) | set(floor_links)) - set(pieces)
     if unknown:
-        raise UnknownLinkError(f"{sorted(unknown)} have no collision geometry; links that do: {tuple(pieces)}")
-    bodies = [_Body(tree, links, pieces, lowest, config) for links in _rigid_bodies(tree, set(pieces) - set(skip))]
+        raise UnknownLinkError(
+            f"{sorted(unknown)} have no collision geometry; links that do: {tuple(pieces)}"
+        )
+    bodies = [
+        _Body(tree, links, pieces, lowest, config) for links in _rigid_bodies(tree, set(pieces) - set(skip))
+    ]
     overshoot = _overshoot_within(bodies, budget)
     rows: dict[str, np.ndarray] = {}
     report = {}
@@ -130,22 +135,45 @@ def _rigid_bodies(tree: KinematicTree, links: Collection[str]) -> list[tuple[str
 def untested_pairs(robot: Robot, config: RobotFitConfig | None = None) -> frozenset[frozenset[str]]:
     """Link pairs that need no self-collision test: neighbours, and pairs that never or (almost) always touch.
 
-    Judged on random configurations within the joint limits (unlimited joints: half a turn either way),
-    as set-up tools for motion planners do.
+    Judged on random configurations within the joint limits (unlimited joints: half a turn either way), as
+    set-up tools for motion planners do. Where only the spheres touch, the collision geometry itself decides.
     """
     config = config or RobotFitConfig()
     links = tuple(robot.sphere_set.spheres)
     lower, upper = robot.joint_limits.clamp(-torch.pi, torch.pi).unbind(-1)
     generator = torch.Generator().manual_seed(config.seed)
-    closest = []
-    for _ in range(0, config.pair_samples, 500):
-        q = lower + (upper - lower) * torch.rand(500, robot.num_dofs, generator=generator)
-        closest.append(_link_gaps(robot, q, links))
-    gaps = torch.cat(closest)
-    never = gaps.amin(0) > config.never_margin
+    q = lower + (upper - lower) * torch.rand(config.pair_samples, robot.num_dofs, generator=generator)
+    gaps = torch.cat([_link_gaps(robot, part, links) for part in q.split(500)])
     always = (gaps <= 0).float().mean(0) >= config.always_share
-    pairs = {frozenset((links[i], links[j])) for i, j in (never | always).nonzero().tolist() if i < j}
-    return frozenset(pairs) | robot.tree.neighbours(links)
+    pieces = collision_pieces(robot.urdf_path)
+    shapes = {link: Shape(pieces[link], config.seed) for link in links if link in pieces}
+    untested = set(robot.tree.neighbours(links))
+    for a, first in enumerate(links):
+        for b in range(a + 1, len(links)):
+            pair = frozenset((first, links[b]))
+            nearest = gaps[:, a, b].topk(min(config.near_samples, len(q)), largest=False)
+            if pair in untested:
+                continue
+            never = nearest.values[0] > config.never_margin
+            if not never and not always[a, b] and pair <= set(shapes):
+                never = (
+                    _geometry_gap(robot, q[nearest.indices], first, links[b], shapes) > config.never_margin
+                )
+            if never or always[a, b]:
+                untested.add(pair)
+    return frozenset(untested)
+
+
+def _geometry_gap(robot: Robot, q: Tensor, first: str, second: str, shapes: Mapping[str, Shape]) -> float:
+    """Least distance [m] between surface samples of two links over some configurations (n, dof)."""
+    poses = robot.link_poses(q.double(), [first, second]).numpy()
+    gap = float("inf")
+    for a, b, inner, outer in ((0, 1, first, second), (1, 0, second, first)):
+        points = shapes[inner].surface_points(300)
+        relative = np.linalg.inv(poses[:, b]) @ poses[:, a]
+        moved = points @ relative[:, :3, :3].transpose(0, 2, 1) + relative[:, None, :3, 3]
+        gap = min(gap, float(shapes[outer].signed_distance(moved.reshape(-1, 3)).min()))
+    return gap
 
 
 def _link_gaps(robot: Robot, q: Tensor, links: tuple[str, ...]) -> Tensor:
@@ -171,7 +199,9 @@ def _overshoot_within(bodies: Sequence[_Body], budget: int) -> float:
 
     low, high = 0.0, max(body.cover.shape.size / body.scale for body in bodies)
     if count(high) > budget:
-        raise RobotError(f"{budget} spheres do not cover {len(bodies)} bodies; give more, or a lower `lowest`")
+        raise RobotError(
+            f"{budget} spheres do not cover {len(bodies)} bodies; give more, or a lower `lowest`"
+        )
     while high - low > 2e-4:
         middle = (low + high) / 2
         low, high = (low, middle) if count(middle) <= budget else (middle, high)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-import torch
+
 from jaxtyping import Float
 from torch import Tensor
 
 from robots.errors import RobotError
 
 
+@runtime_checkable
 class Camera(Protocol):
     """Pinhole intrinsics: focal lengths and principal point [px], pixel centres at integer coordinates."""
 
@@ -94,12 +95,16 @@ def _tangent_slopes(lateral: float, z: float, radius: float) -> tuple[float, flo
         return -math.inf, math.inf
     middle, half = math.atan2(lateral, z), math.asin(radius / distance)
     low, high = middle - half, middle + half
-    return (math.tan(low) if low > -math.pi / 2 else -math.inf, math.tan(high) if high < math.pi / 2 else math.inf)
+    return (
+        math.tan(low) if low > -math.pi / 2 else -math.inf,
+        math.tan(high) if high < math.pi / 2 else math.inf,
+    )
 
 
 def _clipped(low: float, high: float, size: int) -> slice:
-    return slice(int(np.clip(math.floor(max(low, -1.0)), 0, size)), int(np.clip(math.ceil(min(high, size)) + 1, 0, size)))
+    first, last = math.floor(max(low, 0.0)) if low < size else size, math.ceil(min(high, size - 1.0))
+    return slice(first, max(last + 1, 0))
 
 
 def _as_numpy(values: np.ndarray | Tensor) -> np.ndarray:
-    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+    return values.detach().cpu().double().numpy() if isinstance(values, Tensor) else np.asarray(values, float)

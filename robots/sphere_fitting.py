@@ -7,6 +7,7 @@ such balls is a set cover; the budget decides h by bisection.
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from robots.errors import RobotError
 
@@ -21,7 +23,7 @@ from robots.errors import RobotError
 SURFACE_POINTS = 12_000
 COVER_POINTS = 1_500  # surface points that the greedy cover must contain
 CANDIDATES = 1_600  # random interior ball centres it chooses from
-GROWTH_POINTS = 20_000  # surface points that the final radii must contain
+GROWTH_POINTS = 30_000  # surface points that the final radii must contain
 RESTARTS = 5  # perturbed repetitions of the greedy cover
 
 
@@ -55,7 +57,9 @@ class Shape:
             raise RobotError("there is no geometry to cover with spheres")
         hulls = [piece.convex_hull for piece in pieces]
         self._rng = np.random.default_rng(seed)
-        self._planes = [(hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(1)) for hull in hulls]
+        self._planes = [
+            (hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(1)) for hull in hulls
+        ]
         self._hulls = hulls
         self.bounds = np.stack([hull.bounds for hull in hulls])
         self.bounds = np.stack([self.bounds[:, 0].min(0), self.bounds[:, 1].max(0)])
@@ -82,13 +86,21 @@ class Shape:
         points = []
         for i, (hull, share) in enumerate(zip(self._hulls, shares, strict=True)):
             sampled, _ = trimesh.sample.sample_surface(hull, int(share), seed=int(self._rng.integers(2**31)))
-            sampled = np.concatenate([sampled, hull.vertices])
+            sampled = np.concatenate([sampled, hull.vertices, self._edge_points(hull, int(share) // 3)])
             buried = np.zeros(len(sampled), dtype=bool)
             for j, (normals, offsets) in enumerate(self._planes):
                 if i != j:
                     buried |= (sampled @ normals.T - offsets).max(1) < -1e-9
             points.append(sampled[~buried])
         return np.concatenate(points)
+
+    def _edge_points(self, hull: trimesh.Trimesh, count: int) -> np.ndarray:
+        """Random points on the edges: where covers by spheres are thin, and area-weighted samples are rare."""
+        ends = hull.vertices[hull.edges_unique]
+        lengths = hull.edges_unique_length
+        chosen = self._rng.choice(len(ends), count, p=lengths / lengths.sum())
+        share = self._rng.random((count, 1))
+        return ends[chosen, 0] + share * (ends[chosen, 1] - ends[chosen, 0])
 
     def interior_points(self, count: int) -> np.ndarray:
         """About 2 `count` interior points (n, 3): random ones, and the same moved towards the medial axis."""
@@ -100,7 +112,9 @@ class Shape:
             if len(points) == count:
                 break
         vertices = np.concatenate([self._rng.permutation(hull.vertices)[:60] for hull in self._hulls])
-        middles = np.concatenate([np.repeat(h.centroid[None], min(60, len(h.vertices)), 0) for h in self._hulls])
+        middles = np.concatenate(
+            [np.repeat(h.centroid[None], min(60, len(h.vertices)), 0) for h in self._hulls]
+        )
         # Balls that reach into corners have their centres on the way from the corner to the middle.
         corners = [vertices + share * (middles - vertices) for share in (0.15, 0.3, 0.45, 0.6)]
         return np.concatenate([points, *corners, self._towards_medial_axis(points)])
@@ -148,7 +162,7 @@ def fit_spheres(
     shape = shape if isinstance(shape, Shape) else Shape(shape, seed)
     cover = BallCover(shape, lowest)
     low, high = 0.0, shape.size
-    for _ in range(12):
+    while high - low > 5e-4:
         middle = (low + high) / 2
         chosen = cover.choose(middle)
         if chosen is not None and len(chosen) <= budget:
@@ -167,8 +181,7 @@ class BallCover:
         self._centres = shape.interior_points(CANDIDATES)
         self._depths = shape.distance(self._centres)
         self._points = np.concatenate([shape.surface_points(COVER_POINTS), self._centres[::5]])
-        gap = self._points[None] - self._centres[:, None]
-        self._gaps = np.sqrt(np.einsum("ijk,ijk->ij", gap, gap)).astype(np.float32)
+        self._gaps = cdist(self._points, self._centres).astype(np.float32)
 
     def choose(self, overshoot: float) -> np.ndarray | None:
         """Indices of few candidate balls that protrude at most `overshoot` [m] and contain all points.
@@ -176,12 +189,13 @@ class BallCover:
         None where no choice of candidates does. The greedy cover is repeated with perturbed gains, since its
         first pick, the largest ball, is often not part of the smallest cover.
         """
-        contains = self._gaps <= self._radii(overshoot)[:, None]
-        if not contains.any(0).all():
+        reached = self._gaps <= self._radii(overshoot).astype(np.float32)
+        if not reached.any(1).all():
             return None
+        contains = np.ascontiguousarray(reached.T)
         rng = np.random.default_rng(0)
         gains = [np.ones(len(contains)), *rng.uniform(0.7, 1.0, (RESTARTS, len(contains)))]
-        return min((_greedy_cover(contains, gain) for gain in gains), key=len)
+        return min((greedy_cover(contains, gain) for gain in gains), key=len)
 
     def fit(self, overshoot: float) -> SphereFit:
         """Solve for an overshoot [m], shrink the balls to what they alone must contain, and measure."""
@@ -191,7 +205,7 @@ class BallCover:
                 f"no spheres that protrude at most {overshoot:.3f} m cover the shape; allow more, or a lower `lowest`"
             )
         spheres = self._shrunk(chosen, overshoot)
-        return self._measured(_grown_to(spheres, self.shape.surface_points(GROWTH_POINTS)))
+        return self._measured(_grown_to(spheres, self.shape.surface_points(GROWTH_POINTS), self._lowest))
 
     def _radii(self, overshoot: float) -> np.ndarray:
         return np.minimum(self._depths + overshoot, self._centres[:, 2] - self._lowest)
@@ -202,12 +216,12 @@ class BallCover:
         The best ball is the one among all candidates that protrudes least while it contains the points.
         """
         radii = self._radii(overshoot)[chosen]
-        for _ in range(6):
-            owner = (self._gaps[chosen] - radii[:, None]).argmin(0)
+        for _ in range(4):
+            owner = (self._gaps[:, chosen] - radii).argmin(1)
             kept = np.unique(owner)
             chosen, radii = chosen[kept].copy(), radii[kept].copy()
             for i, ball in enumerate(kept):
-                needed = self._gaps[:, owner == ball].max(1)
+                needed = self._gaps[owner == ball].max(0)
                 # Among equals prefer the small ball: it hides less free space beside the shape.
                 protrusion = needed - self._depths + 0.05 * needed
                 protrusion[self._centres[:, 2] - needed < self._lowest] = np.inf
@@ -223,25 +237,35 @@ class BallCover:
         for i, sphere in enumerate(spheres):
             points = sphere[:3] + sphere[3] * directions
             others = np.delete(spheres, i, axis=0)
-            hidden = (np.linalg.norm(points[:, None] - others[None, :, :3], axis=2) < others[:, 3]).any(1)
+            hidden = (cdist(points, others[:, :3]) < others[:, 3]).any(1)
             exposed.append(points[~hidden])
         overshoot = self.shape.signed_distance(np.concatenate(exposed)).clip(min=0)
         return SphereFit(
-            spheres, float((gaps <= 0).mean()), float(gaps.max().clip(min=0)), overshoot.mean(), overshoot.max()
+            spheres,
+            float((gaps <= 0).mean()),
+            float(gaps.max().clip(min=0)),
+            overshoot.mean(),
+            overshoot.max(),
         )
 
 
-def _greedy_cover(contains: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Rows of a boolean matrix (sets, points) that together contain every point, redundant ones removed."""
-    counts = contains.sum(1)
+def greedy_cover(contains: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Rows of a boolean matrix (sets, points) that together contain every point, redundant ones removed.
+
+    Each step takes the row with the greatest `gain` (per set) times the number of points it newly contains.
+    That number only ever falls, so a row needs a recount only when it comes to the top (lazy evaluation).
+    """
+    queue = [(-value, i) for i, value in enumerate(np.count_nonzero(contains, axis=1) * gain)]
+    heapq.heapify(queue)
     uncovered = np.ones(contains.shape[1], dtype=bool)
     chosen: list[int] = []
     while uncovered.any():
-        best = int(np.argmax(counts * gain))
-        newly = contains[best] & uncovered
-        chosen.append(best)
-        counts = counts - contains[:, newly].sum(1)
-        uncovered &= ~newly
+        _, best = queue[0]
+        value = -np.count_nonzero(contains[best] & uncovered) * gain[best]
+        heapq.heapreplace(queue, (value, best))
+        if queue[0][1] == best and value < 0:
+            chosen.append(best)
+            uncovered &= ~contains[best]
     times = contains[chosen].sum(0)
     kept = []
     for ball in chosen:
@@ -252,19 +276,22 @@ def _greedy_cover(contains: np.ndarray, gain: np.ndarray) -> np.ndarray:
     return np.array(kept)
 
 
-def _grown_to(spheres: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Grow, for each point outside of all spheres, the one that needs to grow least."""
+def _grown_to(spheres: np.ndarray, points: np.ndarray, lowest: float) -> np.ndarray:
+    """Grow, for each point outside of all spheres, the one that needs to grow least and may reach that low."""
     spheres = spheres.copy()
     for point in points[_protruding(spheres, points) > 0]:
         distances = np.linalg.norm(spheres[:, :3] - point, axis=1)
-        nearest = int((distances - spheres[:, 3]).argmin())
+        growth = distances - spheres[:, 3]
+        # Where no sphere may reach the point, covering it comes before the height limit.
+        growth[spheres[:, 2] - distances < lowest] += 1e3
+        nearest = int(growth.argmin())
         spheres[nearest, 3] = max(spheres[nearest, 3], distances[nearest])
     return spheres
 
 
 def _protruding(spheres: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Signed distance (n,) [m] of points to the union of spheres, negative inside."""
-    return (np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]).min(1)
+    return (cdist(points, spheres[:, :3]) - spheres[:, 3]).min(1)
 
 
 def _fibonacci_sphere(count: int) -> np.ndarray:

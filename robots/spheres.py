@@ -31,19 +31,27 @@ class SphereSet:
     def __post_init__(self) -> None:
         for link, rows in self.spheres.items():
             if rows.ndim != 2 or rows.shape[1] != 4:
-                raise SphereFileError(f"spheres of {link!r} have shape {rows.shape}, expected (n, 4): x y z radius")
+                raise SphereFileError(
+                    f"spheres of {link!r} have shape {rows.shape}, expected (n, 4): x y z radius"
+                )
             if not np.isfinite(rows).all() or (rows[:, 3] <= 0).any():
-                raise SphereFileError(f"spheres of {link!r} must be finite with radius > 0, got {rows.tolist()}")
+                raise SphereFileError(
+                    f"spheres of {link!r} must be finite with radius > 0, got {rows.tolist()}"
+                )
 
     def __len__(self) -> int:
         return sum(len(rows) for rows in self.spheres.values())
 
     def check_links(self, links: Collection[str]) -> None:
         """Raise `UnknownLinkError` if a sphere or a pair names a link that is not in `links`."""
-        named = set(self.spheres) | set(self.floor_links) | {link for pair in self.ignored_pairs for link in pair}
+        named = (
+            set(self.spheres) | set(self.floor_links) | {link for pair in self.ignored_pairs for link in pair}
+        )
         unknown = sorted(named - set(links))
         if unknown:
-            raise UnknownLinkError(f"the sphere set names links {unknown} that the robot lacks; it has {list(links)}")
+            raise UnknownLinkError(
+                f"the sphere set names links {unknown} that the robot lacks; it has {list(links)}"
+            )
 
     def restricted_to(self, links: Collection[str]) -> SphereSet:
         """The same set without links that are not in `links` (e.g. cuRobo's `attached_object`)."""

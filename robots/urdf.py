@@ -127,7 +127,9 @@ def _mount(robot: ElementTree.Element, attachment: Attachment) -> None:
         )
     robot.extend(_parts(part, attachment.urdf, attachment.prefix))
     child = attachment.prefix + attachment.child_root_link
-    robot.append(_joint(f"{child}_mount", "fixed", attachment.parent_link, child, attachment.xyz, attachment.rpy))
+    robot.append(
+        _joint(f"{child}_mount", "fixed", attachment.parent_link, child, attachment.xyz, attachment.rpy)
+    )
 
 
 def _add_planar_base(robot: ElementTree.Element, base: PlanarBase) -> None:
