@@ -69,7 +69,10 @@ class Articulation:
         root = pybullet.getBodyInfo(self.body, physicsClientId=client)[0].decode()
         self.link_index = {root: -1} | {j.link: j.index for j in self.joints.values()}
         self.link_names = {index: name for name, index in self.link_index.items()}
-        self._lighten_frames(Path(urdf_path))
+        tree = ElementTree.parse(urdf_path).getroot()
+        self.mimics = _read_mimics(tree)
+        """By joint that mimics another: that other joint, the multiplier and the offset."""
+        self._lighten_frames(tree)
         self._remove_passive_damping()
 
     def joint(self, name: str) -> Joint:
@@ -157,9 +160,9 @@ class Articulation:
             )
         return joints
 
-    def _lighten_frames(self, path: Path) -> None:
+    def _lighten_frames(self, tree: ElementTree.Element) -> None:
         """Take the weight off links without inertia, which pybullet makes 1 kg with 1 kg m^2."""
-        for link in ElementTree.parse(path).getroot().findall("link"):
+        for link in tree.findall("link"):
             index = self.link_index.get(link.get("name", ""), -1)
             if link.find("inertial") is None and index >= 0:
                 pybullet.changeDynamics(
@@ -181,3 +184,14 @@ class Articulation:
                 jointDamping=0.0,
                 physicsClientId=self.client,
             )
+
+
+def _read_mimics(tree: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
+    """Read the mimic tags of a URDF, which pybullet leaves out."""
+    mimics = {}
+    for joint in tree.findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            scale, offset = float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
+            mimics[joint.get("name", "")] = (mimic.get("joint", ""), scale, offset)
+    return mimics

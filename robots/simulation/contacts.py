@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pybullet
 
@@ -15,9 +15,9 @@ class Contact:
     Attributes:
         link: name of the robot's link.
         body: name of the body it touches, or of the other link for a self-collision.
-        depth: how far the two overlap [m], 0 for a mere touch.
-        force: normal force [N].
-        position: world position on the body (x, y, z) [m].
+        depth: how far the two overlap at the deepest point [m], 0 for a mere touch.
+        force: normal force [N], summed over all points where the two touch.
+        position: world position of the deepest point on the body (x, y, z) [m].
     """
 
     link: str
@@ -30,7 +30,7 @@ class Contact:
 def robot_contacts(
     client: int, robot: int, links: Mapping[int, str], bodies: Mapping[int, Mapping[int, str]]
 ) -> dict[tuple[str, str], Contact]:
-    """Deepest contact for each (link, body) pair of the last physics step.
+    """One contact for each (link, body) pair that touched in the last physics step.
 
     Args:
         client: id of the pybullet client.
@@ -48,6 +48,8 @@ def robot_contacts(
         body = links[point[4]] if other == robot else bodies[other][point[4]]
         contact = Contact(link, body, max(0.0, -distance), point[9], tuple(point[6]))
         known = found.get((link, body))
-        if known is None or contact.depth > known.depth:
-            found[link, body] = contact
+        if known is not None:
+            deeper = max(known, contact, key=lambda c: c.depth)
+            contact = replace(deeper, force=known.force + contact.force)
+        found[link, body] = contact
     return found

@@ -99,8 +99,8 @@ class SimulatedRobot(Articulation):
         self.head_joints = tuple(head_joints)
         self.motors = motors or MotorConfig()
         self.drive = DifferentialDrive(drive) if set(BASE_JOINTS) <= set(joint_names) else None
-        grip = gripper.joint_names if gripper else ()
-        for name in (*self.joint_names, *grip, *self.head_joints):
+        self._fingers = self._finger_spans(gripper) if gripper else {}
+        for name in (*self.joint_names, *self._fingers, *self.head_joints):
             self.joint(name)
         self._indices = [self.joint(name).index for name in self.joint_names]
         self._arm = [n for n in self.joint_names if not (self.drive and n in BASE_JOINTS)]
@@ -174,7 +174,7 @@ class SimulatedRobot(Articulation):
         force = grip.max_force if force is None else force
         if not (0 <= opening <= 1 and force >= 0):
             raise RobotError(f"need opening in [0, 1] and force >= 0 [N], got {opening} and {force}")
-        for name, low, high in zip(grip.joint_names, grip.closed_position, grip.open_position, strict=True):
+        for name, (low, high) in self._fingers.items():
             self._hold(name, low + opening * (high - low), 0.0, float(force))
 
     def command_head(self, pan: float | int, tilt: float | int) -> None:
@@ -255,13 +255,23 @@ class SimulatedRobot(Articulation):
             if joint.kind != pybullet.JOINT_FIXED and name not in self.joint_names:
                 self._hold(name, self.joint_position(name), 0.0)
 
+    def _finger_spans(self, gripper: GripperModel) -> dict[str, tuple[float, float]]:
+        """Closed and open position of the gripper's joints and of the joints that mimic them."""
+        closed, opened = gripper.closed_position, gripper.open_position
+        spans = dict(zip(gripper.joint_names, zip(closed, opened, strict=True), strict=True))
+        for name, (leader, scale, offset) in self.mimics.items():
+            if leader in spans and name not in spans:
+                low, high = spans[leader]
+                spans[name] = (scale * low + offset, scale * high + offset)
+        return spans
+
     def _prepare_fingers(self, gripper: GripperModel) -> None:
         m = self.motors
-        fingers = [self.joint(name) for name in gripper.joint_names]
-        for finger in fingers:
+        for name, (_, opened) in self._fingers.items():
+            index = self.joint(name).index
             pybullet.changeDynamics(
                 self.body,
-                finger.index,
+                index,
                 lateralFriction=m.finger_friction,
                 spinningFriction=m.finger_spinning_friction,
                 contactStiffness=m.finger_stiffness,
@@ -269,12 +279,13 @@ class SimulatedRobot(Articulation):
                 frictionAnchor=True,
                 physicsClientId=self.client,
             )
-        for finger, position in zip(fingers, gripper.open_position, strict=True):
-            pybullet.resetJointState(self.body, finger.index, position, physicsClientId=self.client)
-        low, high = np.array(gripper.closed_position), np.array(gripper.open_position)
-        if len(fingers) == 2 and np.isclose(low[0] * high[1], low[1] * high[0]):
-            ratio = float((high - low)[0] / (high - low)[1])
-            self._couple(fingers[0], fingers[1], ratio, gripper.max_force)
+            pybullet.resetJointState(self.body, index, opened, physicsClientId=self.client)
+        if len(self._fingers) == 2:
+            (first, a), (second, b) = self._fingers.items()
+            # The gear knows no offset: both fingers must pass zero together.
+            if np.isclose(a[0] * b[1], a[1] * b[0]):
+                ratio = (a[1] - a[0]) / (b[1] - b[0])
+                self._couple(self.joint(first), self.joint(second), ratio, gripper.max_force)
         self.command_gripper(1.0)
 
     def _couple(self, first: Joint, second: Joint, ratio: float, force: float) -> None:

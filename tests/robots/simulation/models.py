@@ -62,9 +62,11 @@ def inertia(mass: float, moment: float) -> str:
 
 @dataclass(frozen=True)
 class Hand:
-    joint_names: tuple[str, ...] = ("panda_finger_joint1", "panda_finger_joint2")
-    open_position: tuple[float, ...] = (0.04, 0.04)
-    closed_position: tuple[float, ...] = (0.0, 0.0)
+    """The Panda's hand: its second finger mimics the first, as the URDF says."""
+
+    joint_names: tuple[str, ...] = ("panda_finger_joint1",)
+    open_position: tuple[float, ...] = (0.04,)
+    closed_position: tuple[float, ...] = (0.0,)
     max_force: float = 20.0
 
 

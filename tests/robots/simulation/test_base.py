@@ -12,7 +12,7 @@ def test_speed_and_acceleration_are_limited():
     config = DriveConfig(max_speed=0.5, max_turn_rate=0.8, max_acceleration=1.0, max_turn_acceleration=2.0)
     drive = DifferentialDrive(config)
     drive.command(5.0, -5.0)
-    track = np.array([drive.advance(0.01) for _ in range(200)])
+    track = np.array([(0.0, 0.0), *(drive.advance(0.01) for _ in range(200))])
     assert track[-1] == pytest.approx([0.5, -0.8])
     assert (np.abs(np.diff(track, axis=0)).max(axis=0) <= np.array([0.01, 0.02]) + 1e-12).all()
     drive.command(0.0, 0.0)
