@@ -179,7 +179,7 @@ class World:
             SceneError: if there is no such solid.
         """
         return pose_matrix(
-            *pybullet.getBasePositionAndOrientation(self._body(name), physicsClientId=self.client)
+            *pybullet.getBasePositionAndOrientation(self.body_id(name), physicsClientId=self.client)
         )
 
     def set_object_pose(self, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
@@ -188,7 +188,7 @@ class World:
         Raises:
             SceneError: if there is no such solid.
         """
-        body = self._body(name)
+        body = self.body_id(name)
         pybullet.resetBasePositionAndOrientation(body, *split_pose(pose), physicsClientId=self.client)
         pybullet.resetBaseVelocity(body, [0, 0, 0], [0, 0, 0], physicsClientId=self.client)
         if self._solids[name].mass == 0:
@@ -214,7 +214,7 @@ class World:
         Raises:
             SceneError: if there is no such solid.
         """
-        body = self._body(name)
+        body = self.body_id(name)
         pybullet.removeBody(body, physicsClientId=self.client)
         del self._bodies[name], self._solids[name], self._names[body]
 
@@ -226,7 +226,12 @@ class World:
         """
         return SceneField(solid.at(self.object_pose(name)) for name, solid in self._solids.items())
 
-    def _body(self, name: str) -> int:
+    def body_id(self, name: str) -> int:
+        """Return pybullet's id of a solid, for what the world has no method for.
+
+        Raises:
+            SceneError: if there is no such solid.
+        """
         if name not in self._bodies:
             raise SceneError(f"no solid named {name!r} in the world; there are {sorted(self._bodies)}")
         return self._bodies[name]

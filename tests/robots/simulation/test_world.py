@@ -8,6 +8,7 @@ import torch
 from robots.errors import RobotError, SceneError, UnknownJointError, UnknownLinkError
 from robots.simulation import Box, Scene, Sphere, World
 from robots.simulation.poses import planar_pose
+from robots.simulation.rooms import can, small_box
 from tests.robots.simulation.models import CART_JOINTS, PANDA_JOINTS, PANDA_URDF, Hand
 
 HEAD = ("pan_joint", "tilt_joint")
@@ -203,8 +204,6 @@ def _move(world: World, start: np.ndarray, end: np.ndarray, duration: float = 2.
 
 @pytest.mark.parametrize("kind", ["box", "can"])
 def test_the_hand_lifts_and_holds_an_object(kind):
-    from robots.simulation.rooms import can, small_box
-
     thing = (small_box if kind == "box" else can)("thing").at(planar_pose(0.5, 0, 0.46))
     with World(_panda_table(thing)) as world:
         q = np.array([0.0, 0.3, 0.0, -2.0, 0.0, 2.3, 0.785])
@@ -232,9 +231,29 @@ def test_the_hand_lifts_and_holds_an_object(kind):
         assert world.object_pose("thing")[2, 3] < 0.5, "an opened hand drops it"
 
 
-def test_a_weak_grip_does_not_lift():
-    from robots.simulation.rooms import small_box
+def test_a_held_object_cannot_be_pushed_sideways_between_the_fingers():
+    thing = small_box("thing").at(planar_pose(0.5, 0, 0.46))
+    with World(_panda_table(thing)) as world:
+        q = np.array([0.0, 0.3, 0.0, -2.0, 0.0, 2.3, 0.785])
+        world.add_robot(PANDA_URDF, PANDA_JOINTS, q, gripper=Hand())
+        high = _reach(world, 0.585, q)
+        _reach(world, 0.485, high)
+        world.command_gripper(0)
+        world.step(1.0)
+        _move(world, world.robot_state()[0], high)
+        before = world.object_pose("thing")[:3, 3]
+        # Along the fingers' axis, which is the world's y, and less than the grip can bear.
+        for _ in range(240):
+            body = world.body_id("thing")
+            force, at = [0.0, 8.0, 0.0], world.object_pose("thing")[:3, 3].tolist()
+            pybullet.applyExternalForce(
+                body, -1, force, at, pybullet.WORLD_FRAME, physicsClientId=world.client
+            )
+            world.step()
+        assert np.linalg.norm(world.object_pose("thing")[:3, 3] - before) < 3e-3
 
+
+def test_a_weak_grip_does_not_lift():
     thing = small_box("thing").at(planar_pose(0.5, 0, 0.46))
     with World(_panda_table(thing)) as world:
         q = np.array([0.0, 0.3, 0.0, -2.0, 0.0, 2.3, 0.785])
