@@ -34,7 +34,9 @@ def _piece(collision: ElementTree.Element, urdf: str | Path) -> trimesh.Trimesh:
         raise UrdfError(f"{urdf}: a <collision> element has no geometry")
     shape = geometry[0]
     if shape.tag == "mesh":
-        loaded = trimesh.load(str(resolve_mesh(shape.get("filename", ""), urdf)), force="mesh")
+        loaded = trimesh.load_mesh(str(resolve_mesh(shape.get("filename", ""), urdf)))
+        if isinstance(loaded, trimesh.Scene):
+            loaded = loaded.to_mesh()
         scale = np.array(shape.get("scale", "1 1 1").split(), dtype=float)
         piece = trimesh.Trimesh(loaded.vertices * scale, loaded.faces).convex_hull
     elif shape.tag == "box":

@@ -154,7 +154,7 @@ def untested_pairs(robot: Robot, config: RobotFitConfig | None = None) -> frozen
             nearest = gaps[:, a, b].topk(min(config.near_samples, len(q)), largest=False)
             if pair in untested:
                 continue
-            never = nearest.values[0] > config.never_margin
+            never = bool(nearest.values[0] > config.never_margin)
             if not never and not always[a, b] and pair <= set(shapes):
                 never = (
                     _geometry_gap(robot, q[nearest.indices], first, links[b], shapes) > config.never_margin

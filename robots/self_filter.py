@@ -6,7 +6,6 @@ import math
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-
 from jaxtyping import Float
 from torch import Tensor
 

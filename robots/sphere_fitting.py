@@ -7,7 +7,6 @@ such balls is a set cover; the budget decides h by bisection.
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +19,11 @@ from scipy.spatial.distance import cdist
 from robots.errors import RobotError
 
 # Distances are taken to a dense surface sample; this many points keep their error near a millimetre.
-SURFACE_POINTS = 12_000
+SURFACE_POINTS = 10_000
 COVER_POINTS = 1_500  # surface points that the greedy cover must contain
 CANDIDATES = 1_600  # random interior ball centres it chooses from
 GROWTH_POINTS = 30_000  # surface points that the final radii must contain
-RESTARTS = 5  # perturbed repetitions of the greedy cover
+RESTARTS = 4  # perturbed repetitions of the greedy cover
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ class Shape:
         points = points.copy()
         depth, nearest = self._surface.query(points)
         step = np.full(len(points), 0.5)
-        for _ in range(20):
+        for _ in range(10):
             trial = points + step[:, None] * (points - self._surface.data[nearest])
             reached, beside = self._surface.query(trial)
             better = reached > depth
@@ -189,12 +188,11 @@ class BallCover:
         None where no choice of candidates does. The greedy cover is repeated with perturbed gains, since its
         first pick, the largest ball, is often not part of the smallest cover.
         """
-        reached = self._gaps <= self._radii(overshoot).astype(np.float32)
-        if not reached.any(1).all():
+        contains = self._gaps <= self._radii(overshoot).astype(np.float32)
+        if not contains.any(1).all():
             return None
-        contains = np.ascontiguousarray(reached.T)
         rng = np.random.default_rng(0)
-        gains = [np.ones(len(contains)), *rng.uniform(0.7, 1.0, (RESTARTS, len(contains)))]
+        gains = [np.ones(len(self._centres)), *rng.uniform(0.7, 1.0, (RESTARTS, len(self._centres)))]
         return min((greedy_cover(contains, gain) for gain in gains), key=len)
 
     def fit(self, overshoot: float) -> SphereFit:
@@ -250,40 +248,37 @@ class BallCover:
 
 
 def greedy_cover(contains: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Rows of a boolean matrix (sets, points) that together contain every point, redundant ones removed.
+    """Columns of a boolean matrix (points, sets) that together contain every point, redundant ones removed.
 
-    Each step takes the row with the greatest `gain` (per set) times the number of points it newly contains.
-    That number only ever falls, so a row needs a recount only when it comes to the top (lazy evaluation).
+    Each step takes the set with the greatest `gain` (per set) times the number of points it newly contains.
     """
-    queue = [(-value, i) for i, value in enumerate(np.count_nonzero(contains, axis=1) * gain)]
-    heapq.heapify(queue)
-    uncovered = np.ones(contains.shape[1], dtype=bool)
+    counts = contains.sum(0, dtype=np.int32)
+    uncovered = np.ones(len(contains), dtype=bool)
     chosen: list[int] = []
     while uncovered.any():
-        _, best = queue[0]
-        value = -np.count_nonzero(contains[best] & uncovered) * gain[best]
-        heapq.heapreplace(queue, (value, best))
-        if queue[0][1] == best and value < 0:
-            chosen.append(best)
-            uncovered &= ~contains[best]
-    times = contains[chosen].sum(0)
+        best = int(np.argmax(counts * gain))
+        newly = contains[:, best] & uncovered
+        chosen.append(best)
+        counts -= contains[newly].sum(0, dtype=np.int32)
+        uncovered &= ~newly
+    times = contains[:, chosen].sum(1)
     kept = []
     for ball in chosen:
-        if (times[contains[ball]] > 1).all():
-            times = times - contains[ball]
+        if (times[contains[:, ball]] > 1).all():
+            times = times - contains[:, ball]
         else:
             kept.append(ball)
     return np.array(kept)
 
 
 def _grown_to(spheres: np.ndarray, points: np.ndarray, lowest: float) -> np.ndarray:
-    """Grow, for each point outside of all spheres, the one that needs to grow least and may reach that low."""
+    """Grow, for each point outside of all spheres, the one that needs to grow least, preferably not below `lowest`."""
     spheres = spheres.copy()
     for point in points[_protruding(spheres, points) > 0]:
         distances = np.linalg.norm(spheres[:, :3] - point, axis=1)
         growth = distances - spheres[:, 3]
-        # Where no sphere may reach the point, covering it comes before the height limit.
-        growth[spheres[:, 2] - distances < lowest] += 1e3
+        # Reaching below the height limit weighs thrice: it may cost growth elsewhere, but not any amount.
+        growth += 3.0 * (lowest - (spheres[:, 2] - distances)).clip(min=0)
         nearest = int(growth.argmin())
         spheres[nearest, 3] = max(spheres[nearest, 3], distances[nearest])
     return spheres

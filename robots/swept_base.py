@@ -56,7 +56,7 @@ class SweptBase:
         self._radii = torch.as_tensor(swept[:, 3]).to(q)
 
     def spheres(
-        self, q: Float[Tensor, "*batch 2"]
+        self, q: Float[Tensor, "*batch dof"]
     ) -> tuple[Float[Tensor, "*batch spheres 3"], Float[Tensor, " spheres"]]:
         """Spheres of the turning base at positions q [m]: centres [m, world] and radii [m], differentiable.
 
@@ -113,14 +113,14 @@ class _Profile:
         thinned = np.zeros_like(half)
         thinned[steps % 2 :: 2, ::2] = True
         self._centres, self._depths = grid[half & thinned], depth[half & thinned]
-        self._gaps = cdist(self._centres, self._points)
+        self._gaps = cdist(self._points, self._centres)
 
     def cover(self, slack: float) -> np.ndarray:
         """Spheres (n, 4) that cover the swept volume and protrude at most about `slack` [m]."""
         # Half of the slack goes to the discs, half to the chord between neighbours of a ring.
         radii = self._depths + slack / 2
         counts = np.array([_ring_size(arm, slack / 2) for arm in self._centres[:, 0]])
-        chosen = greedy_cover(self._gaps <= radii[:, None], gain=1.0 / counts)
+        chosen = greedy_cover(self._gaps <= radii, gain=1.0 / counts)
         rings = []
         for (arm, z), radius, count in zip(self._centres[chosen], radii[chosen], counts[chosen], strict=True):
             heading = 2 * np.pi * np.arange(count) / count

@@ -95,5 +95,5 @@ def test_bad_requests_are_refused(panda: robots.Robot) -> None:
     with pytest.raises(robots.RobotError, match="7"):
         solve(panda, torch.eye(4), torch.zeros(6))
     no_tool = robots.Robot.from_urdf(panda.urdf_path, panda.sphere_set)
-    with pytest.raises(robots.RobotError, match="tool link"):
+    with pytest.raises(robots.RobotError, match="no tool_link"):
         solve(no_tool, torch.eye(4), no_tool.rest)
