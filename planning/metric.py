@@ -40,13 +40,13 @@ class MetricConfig:
 
 
 class Metric:
-    """Smoothness F(q) = 1/2 sum_d w_d |K_d q|^2 of n waypoints and its metric A = sum_d w_d K_d^T K_d +
-    ridge.
+    """Smoothness F(q) = 1/2 sum_d w_d |K_d q|^2 of n waypoints, and its metric A.
 
-    K_d are finite differences of order d; before the first and after the last waypoint the robot rests. The
-    first and last waypoint are fixed, so A is over the n - 2 interior ones. The whole is scaled so that a
-    unit push on the waypoint that gives way most moves it by one unit, whichever derivatives are weighted
-    (CHOMP, equations 10-17). Matrices are kept in float64 (A is ill-conditioned), arguments keep their type.
+    A = sum_d w_d K_d^T K_d + ridge. K_d are finite differences of order d; before the first and after the
+    last waypoint the robot rests. The first and last waypoint are fixed, so A is over the n - 2 interior
+    ones. The whole is scaled so that a unit push on the waypoint that gives way most moves it by one unit,
+    whichever derivatives are weighted (CHOMP, equations 10-17). Matrices are kept in float64 (A is
+    ill-conditioned), arguments keep their type.
     """
 
     def __init__(self, num_waypoints: int, config: MetricConfig | None = None) -> None:

@@ -17,8 +17,7 @@ from planning.workspace import Workspace
 
 @dataclass(frozen=True)
 class ObjectiveConfig:
-    """Weights of the objective U = smoothness_weight F + obstacle_weight U_obs + self_collision_weight
-    U_self.
+    """Weights of smoothness_weight F + obstacle_weight U_obs + self_collision_weight U_self.
 
     Args:
         smoothness_weight: small, since free paths matter more than short ones.

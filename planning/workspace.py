@@ -110,10 +110,10 @@ class Workspace:
                 gradient = gradient.masked_fill(exempt.unsqueeze(-1), 0.0)
         else:
             clearance = self.clearance(centres, radii)
-            near = ~(clearance >= self.eps)  # NaN included
+            near = clearance < self.eps
             gradient = torch.zeros_like(centres)
-            # Most spheres are far from anything, and gradients cost more than distances.
-            gradient[near] = self.field.distance_and_gradient(centres[near])[1].detach()
+            if near.any():  # most spheres are far from anything, and gradients cost more than distances
+                gradient[near] = self.field.distance_and_gradient(centres[near])[1].detach()
             cost, slope = hinge_cost(clearance, self.eps)
             gradient = slope.unsqueeze(-1) * gradient
         unknown = self.unknown(centres)
@@ -124,7 +124,7 @@ class Workspace:
     def _on_floor(
         self, floor_distance: Float[Tensor, "*batch floor"], centres: Float[Tensor, "*batch s 3"]
     ) -> Bool[Tensor, "*batch s"]:
-        """Which spheres may touch what is nearest to them because it is the floor; takes floor spheres'
+        """Which spheres are exempt since the floor is what is nearest to them, given floor spheres'
         distances.
 
         The distance alone would also excuse a wall that is nearly as near as the floor, up to the tolerance

@@ -226,6 +226,7 @@ def test_nan_in_the_field_is_reported():
     waypoints = torch.tensor([[0.0, 1.0], [1.0, 1.0], [2.0, 1.0], [1.0, 1.2], [0.0, 1.2]])
     beyond = Chomp(Disc()).optimise(Trajectory.through(waypoints, 30), field)
     assert beyond.status is Status.INVALID_FIELD and "NaN" in beyond.message
+    assert beyond.iterations == 0  # there is no gradient to follow
 
 
 def test_mismatched_joints_and_bad_settings_are_refused():

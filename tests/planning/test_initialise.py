@@ -98,6 +98,13 @@ def test_edges_are_free_up_to_the_first_obstacle():
     torch.testing.assert_close(reached, torch.tensor([0.35, 1.0, 1.0]), rtol=0, atol=0.02)
 
 
+def test_configurations_that_are_not_free():
+    arm = PlanarArm((0.4, 0.2, 0.4))
+    space = StateSpace(arm, Sphere((0.8, 0.0, 0.5), 0.1), torch.zeros(3), torch.ones(3), RrtConfig())
+    folded, outside, touching, fine = [1.5, 2.9, 2.9], [1.5, 3.1, 0.0], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0]
+    assert space.free(torch.tensor([folded, outside, touching, fine])).tolist() == [False, False, False, True]
+
+
 def test_joints_weigh_what_they_move():
     arm = PlanarArm((0.5, 0.5), per_link=10)
     space = StateSpace(arm, FAR, torch.zeros(2), torch.zeros(2), RrtConfig())

@@ -53,6 +53,16 @@ def test_smoothness_of_one_motion_does_not_depend_on_the_number_of_waypoints():
     assert values[0] == pytest.approx(values[1], rel=2e-2)
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_gradient_of_order_d_vanishes_for_polynomials_below_2d(order):
+    """d^2k q / dt^2k = 0, away from the ends."""
+    weights = [0.0, 0.0, 0.0]
+    weights[order - 1] = 1.0
+    metric, t = Metric(31, MetricConfig(*weights)), torch.linspace(-1, 1, 31, dtype=torch.float64)
+    gradient = metric.smoothness(torch.stack([t ** (2 * order - 1), t ** (2 * order)], dim=1))[1][5:-5]
+    assert float(gradient[:, 0].abs().max()) < 1e-6 * float(gradient[:, 1].abs().max())
+
+
 def test_solve_inverts_the_hessian_of_the_smoothness():
     metric, q = Metric(10, MetricConfig(ridge=0.0)), torch.rand(10, 2, dtype=torch.float64)
     newton = q.clone()
@@ -77,5 +87,6 @@ def test_projection_keeps_limits_and_leaves_what_is_within():
     assert torch.equal(projected[:, 1], q[:, 1])
     # Smooth: no jump larger than the largest one before by more than a little.
     assert float(projected.diff(dim=0)[:, 0].abs().max()) < 1.5 * float(q.diff(dim=0)[:, 0].abs().max())
+    assert float(project_to_limits(q, limits, metric, iterations=0)[:, 0].max()) <= 0.5
     inside = 0.4 * q
     assert torch.equal(project_to_limits(inside, limits, metric), inside)

@@ -67,6 +67,13 @@ def test_free_is_what_keeps_the_margin():
         assert _objective(Disc(0.1), scene, 3)(line).free is free
 
 
+def test_an_arm_folded_into_itself_is_not_free():
+    arm, far = PlanarArm((0.4, 0.2, 0.4)), Sphere((50.0, 0.0, 0.0), 1.0)
+    for elbow, free in ((1.0, True), (2.9, False)):
+        q = torch.tensor([[0.0, 1.0, 1.0], [0.0, elbow, elbow], [0.0, 1.0, 1.0]])
+        assert _objective(arm, far, 3)(q).free is free
+
+
 def test_unknown_space_costs_at_least_as_much_as_a_surface():
     nothing = Sphere((0.0, 0.0, 50.0), 1.0)
     q = torch.tensor([[x, 0.0] for x in (0.0, 1.0, 2.0)])

@@ -6,6 +6,7 @@ import pytest
 
 from planning import ConfigError, TrajectoryError
 from planning.tracking import BaseTracker, TrackerConfig
+from planning.unicycle_mpc import UnicycleMpc
 
 S = np.linspace(0, 4, 80)
 S_CURVE = np.stack([S, 0.6 * np.sin(S * np.pi / 2)], axis=1)
@@ -100,6 +101,17 @@ def test_a_path_of_one_point_and_a_path_already_driven():
     for path in (np.zeros((1, 2)), np.zeros((3, 2)), np.array([[-1.0, 0.0], [0.0, 0.0]])):
         tracker = BaseTracker()
         assert tracker.command(np.array([0.01, 0.0, 0.3]), path) == (0.0, 0.0) and tracker.finished
+
+
+def test_the_controller_plans_within_accelerations_and_steers_to_the_side_of_its_target():
+    controller = UnicycleMpc(10, 0.1, (-0.1, -1.0), (0.5, 1.0), accelerations=(0.6, 2.0))
+    ahead = np.stack([np.linspace(0.05, 0.5, 10), np.zeros(10), np.zeros(10)])
+    v, omega = controller.solve(np.zeros(3), np.zeros(2), ahead)
+    assert v == pytest.approx(0.06) and omega == pytest.approx(0.0, abs=1e-9)
+    for side in (1, -1):
+        controller.reset()
+        left = ahead + side * np.array([[0.0], [0.1], [0.0]])
+        assert side * controller.solve(np.zeros(3), np.array([0.4, 0.0]), left)[1] > 0.05
 
 
 def test_commands_are_quick():
