@@ -10,7 +10,8 @@ from collections.abc import Callable
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from .sampling import RayBatch, valid_normals
@@ -54,17 +55,25 @@ def batch_bound(batch: RayBatch) -> Bound:
     return sign * offset.norm(dim=-1), sign[..., None] * offset
 
 
-def nearest(points: Float[Tensor, "n 3"], targets: Float[Tensor, "m 3"]) -> Tensor:
-    """Index of the closest target of every point, by a matrix product in blocks that fit the cache and memory."""
+def nearest(points: Float[Tensor, "n 3"], targets: Float[Tensor, "m 3"]) -> Int[Tensor, "n"]:
+    """Index of the closest target of every point: by a tree on the CPU, by matrix products elsewhere."""
+    if points.device.type != "cpu":
+        return _nearest_by_product(points, targets)
+    tree = cKDTree(targets.numpy(), balanced_tree=False, compact_nodes=False)
+    return torch.from_numpy(tree.query(points.numpy())[1])
+
+
+def _nearest_by_product(points: Tensor, targets: Tensor) -> Tensor:
+    """In blocks that bound the memory of the table of distances."""
     centre = targets.mean(dim=0)  # small numbers keep |p|^2 - 2 x.p accurate far from the origin
     targets = targets - centre
     square = (targets * targets).sum(dim=-1)
-    rows = max(1, TABLE_ENTRIES // max(1, len(targets)))
+    rows = max(1, TABLE_ENTRIES // len(targets))
     found = [
         torch.addmm(square, block - centre, targets.T, alpha=-2).min(dim=1).indices
         for block in points.split(rows)
     ]
-    return torch.cat(found) if found else torch.zeros(0, dtype=torch.long)
+    return torch.cat(found)
 
 
 BOUNDS: dict[BoundMethod, Callable[[RayBatch], Bound]] = {

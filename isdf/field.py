@@ -119,7 +119,9 @@ class GridField:
         check_points(points)
         if torch.is_grad_enabled() and points.requires_grad:
             return _AnalyticGradient.apply(points, self)
-        return self.distance_and_gradient(points)[0]
+        with torch.no_grad():
+            corners, t, _ = self._cells(points)
+            return _trilinear(corners, t)[0].to(points).view(points.shape[:-1])
 
     def distance_and_gradient(
         self, points: Float[Tensor, "*batch 3"]
@@ -127,36 +129,42 @@ class GridField:
         """Signed distance [m] and the exact gradient of the interpolant; no autograd graph."""
         check_points(points)
         with torch.no_grad():
-            flat = points.detach().reshape(-1, 3).to(self.values)
-            sizes = torch.tensor(self.values.shape, device=flat.device)
-            unclamped = (flat - self.origin.to(flat)) / self.spacing
-            cell = torch.minimum(unclamped.clamp(min=0), (sizes - 1).to(flat))
-            base = torch.minimum(cell.long(), sizes - 2)
-            t = cell - base
-            strides = torch.tensor(self.values.stride(), device=flat.device)
-            corner = (base * strides).sum(dim=-1)
-            v = self.values.view(-1)
-            sx, sy, sz = strides.tolist()
-            c = [[[v[corner + i * sx + j * sy + k * sz] for k in (0, 1)] for j in (0, 1)] for i in (0, 1)]
-            distance, gradient = _trilinear(c, t)
-            inside = unclamped == cell
-            gradient = torch.where(inside, gradient / self.spacing, torch.zeros_like(gradient))
+            corners, t, inside = self._cells(points)
+            distance, faces = _trilinear(corners, t)
+            gradient = _trilinear_gradient(corners, t, faces) / self.spacing
+            gradient = torch.where(inside, gradient, torch.zeros_like(gradient))
         return distance.to(points).view(points.shape[:-1]), gradient.to(points).view(points.shape)
 
+    def _cells(self, points: Tensor) -> tuple[list, Tensor, Tensor]:
+        """The 8 corner values c[i][j][k] of each point's cell, its place t in the cell, and what is inside."""
+        flat = points.detach().reshape(-1, 3).to(self.values)
+        sizes = torch.tensor(self.values.shape, device=flat.device)
+        unclamped = (flat - self.origin.to(flat)) / self.spacing
+        cell = torch.minimum(unclamped.clamp(min=0), (sizes - 1).to(flat))
+        base = torch.minimum(cell.long(), sizes - 2)
+        strides = torch.tensor(self.values.stride(), device=flat.device)
+        corner = (base * strides).sum(dim=-1)
+        v = self.values.view(-1)
+        sx, sy, sz = strides.tolist()
+        c = [[[v[corner + i * sx + j * sy + k * sz] for k in (0, 1)] for j in (0, 1)] for i in (0, 1)]
+        return c, cell - base, unclamped == cell
 
-def _trilinear(c: list, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Value and gradient (per cell) of trilinear interpolation between the 8 corners c[i][j][k] at t in [0, 1]^3."""
+
+def _trilinear(c: list, t: Tensor) -> tuple[Tensor, tuple[list, list]]:
+    """Value of trilinear interpolation at t in [0, 1]^3, and the intermediate edges and faces."""
     x, y, z = t.unbind(dim=-1)
-    edge = [[c[i][j][0] + z * (c[i][j][1] - c[i][j][0]) for j in (0, 1)] for i in (0, 1)]
-    dz = [[c[i][j][1] - c[i][j][0] for j in (0, 1)] for i in (0, 1)]
-    face = [edge[i][0] + y * (edge[i][1] - edge[i][0]) for i in (0, 1)]
+    edge = [[torch.lerp(c[i][j][0], c[i][j][1], z) for j in (0, 1)] for i in (0, 1)]
+    face = [torch.lerp(edge[i][0], edge[i][1], y) for i in (0, 1)]
+    return torch.lerp(face[0], face[1], x), (edge, face)
+
+
+def _trilinear_gradient(c: list, t: Tensor, faces: tuple[list, list]) -> Tensor:
+    """Gradient of that value with respect to t."""
+    x, y, _ = t.unbind(dim=-1)
+    edge, face = faces
     dy = [edge[i][1] - edge[i][0] for i in (0, 1)]
-    dz_face = [dz[i][0] + y * (dz[i][1] - dz[i][0]) for i in (0, 1)]
-    value = face[0] + x * (face[1] - face[0])
-    gradient = torch.stack(
-        [face[1] - face[0], dy[0] + x * (dy[1] - dy[0]), dz_face[0] + x * (dz_face[1] - dz_face[0])], dim=-1
-    )
-    return value, gradient
+    dz = [torch.lerp(c[i][0][1] - c[i][0][0], c[i][1][1] - c[i][1][0], y) for i in (0, 1)]
+    return torch.stack([face[1] - face[0], torch.lerp(dy[0], dy[1], x), torch.lerp(dz[0], dz[1], x)], dim=-1)
 
 
 def grid_points(bounds: Float[Tensor, "2 3"], spacing: float) -> Float[Tensor, "nx ny nz 3"]:

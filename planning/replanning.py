@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
+from torch import Tensor
 
 from planning.chomp import ChompConfig
 from planning.clock import Clock, MeasuredClock, OnlineMap
@@ -27,8 +28,12 @@ from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
 from planning.trajectory import Trajectory
 from planning.validation import ValidationConfig, check
+from planning.workspace import Workspace, WorkspaceConfig
 
 logger = logging.getLogger(__name__)
+
+# A map still being learned has the floor some centimetres wrong.
+LEARNED_FLOOR = WorkspaceConfig(floor_tolerance=0.10)
 
 
 @runtime_checkable
@@ -69,6 +74,10 @@ class ReplanningConfig:
             still being learned is some centimetres wrong and the robot stands where it stands.
         clearance_change: a plan is made anew when the map has taken this much [m] of its clearance.
         scan: angle [rad] turned on the spot at the start, to see what is around.
+        scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
+        retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
+        detour: while the goal is blocked on the map, the nearest free place within this distance [m] of it is driven
+            to; the map there may be wrong until it is seen from near.
         look_ahead: distance along the path [m] at which the camera looks.
         patience: plans in a row that may fail before the goal is called unreachable.
         time_limit: [s] of the robot's time.
@@ -77,8 +86,10 @@ class ReplanningConfig:
     planner: PlannerConfig = field(
         default_factory=lambda: PlannerConfig(
             num_waypoints=40,
-            chomp=ChompConfig(eps=0.35, max_iterations=120),
-            rrt=RrtConfig(seconds=3.0),
+            chomp=ChompConfig(
+                eps=0.35, max_iterations=120, validation=ValidationConfig(workspace=LEARNED_FLOOR)
+            ),
+            rrt=RrtConfig(seconds=1.5, workspace=LEARNED_FLOOR),
         )
     )
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
@@ -86,8 +97,11 @@ class ReplanningConfig:
     least_margin: float = -0.10
     clearance_change: float = 0.05
     scan: float = 2 * math.pi
+    scan_rate: float = 0.5
+    retry: float = 1.0
+    detour: float = 1.5
     look_ahead: float = 1.5
-    patience: int = 20
+    patience: int = 15
     time_limit: float = 180.0
 
     def __post_init__(self) -> None:
@@ -167,6 +181,8 @@ class ReplanningLoop:
         self.report = DriveReport()
         self._owed = 0.0
         self._failures = 0
+        self._retry_at = -math.inf
+        self._at_goal = False
 
     def drive_to(self, goal: Float[ndarray, "2"], final_yaw: float | None = None) -> DriveReport:
         """Look around, then map, plan and drive until the goal is reached or given up.
@@ -186,14 +202,16 @@ class ReplanningLoop:
             self.report.rounds += 1
             if self.watch:
                 self.watch(self)
-            if self.plan is not None and self.tracker.finished:
+            if self.plan is not None and self.tracker.finished and self._at_goal:
                 self._end(DriveStatus.REACHED, "the base stands on the goal")
                 break
             if self._failures > self.config.patience:
                 self._end(DriveStatus.UNREACHABLE, self.report.message)
                 break
         else:
-            self._end(DriveStatus.TIME_LIMIT, f"not there after {self.config.time_limit:g} s; {self.report.message}")
+            self._end(
+                DriveStatus.TIME_LIMIT, f"not there after {self.config.time_limit:g} s; {self.report.message}"
+            )
         self.robot.drive(0.0, 0.0, self.config.tracker.period)
         self.report.duration = self.robot.time - started
         self.report.goal_distance = float(np.linalg.norm(self.robot.base_state()[:2] - goal))
@@ -201,8 +219,7 @@ class ReplanningLoop:
 
     def _scan(self) -> None:
         """Turn on the spot and map what comes into view."""
-        rate = 0.6 * self.config.tracker.max_yaw_rate
-        turned = 0.0
+        rate, turned = self.config.scan_rate, 0.0
         while True:
             spent = self._sense_and_map()
             if turned >= self.config.scan:
@@ -235,54 +252,81 @@ class ReplanningLoop:
 
     def _plan_if_needed(self, goal: Float[ndarray, "2"]) -> tuple[PlanResult | None, float]:
         """The plan to follow from now on (None: stand), and the time it took to find out."""
-
-        def decide() -> PlanResult | None:
-            self.field = self.snapshot()
-            if self._still_good():
-                return self.plan
-            fresh = self._planned(goal)
-            self.report.plans += 1
-            self._failures = 0 if fresh.success else self._failures + 1
-            if fresh.success:
-                return fresh
-            self.report.failed_plans += 1
-            self.report.message = f"{fresh.status.value}: {fresh.message}"
-            logger.info("no plan: %s", self.report.message)
-            return None
-
+        if self.plan is None and self.robot.time < self._retry_at:
+            return None, 0.0
         plans = self.report.plans
-        plan, spent = self.clock.charge(decide)
+        plan, spent = self.clock.charge(lambda: self._decide(goal))
         self.report.planning_seconds += spent
         if self.report.plans > plans:
             self.report.slowest_plan = max(self.report.slowest_plan, spent)
         return plan, spent
 
-    def _still_good(self) -> bool:
-        """Whether what is left of the plan keeps its clearance on the new map."""
+    def _decide(self, goal: Float[ndarray, "2"]) -> PlanResult | None:
+        """Keep the plan while it is good; else make one, to the goal or as near to it as the map allows."""
+        self.field = self.snapshot()
+        start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
+        target = self._attainable(start, torch.as_tensor(goal, dtype=torch.float32))
+        if self._still_good(target):
+            return self.plan
+        fresh = self._planned(start, target)
+        self.report.plans += 1
+        if fresh.success:
+            self._failures, self._at_goal = 0, bool(torch.allclose(target, torch.as_tensor(goal).to(target)))
+            return fresh
+        self._failures += 1
+        self._retry_at = self.robot.time + self.config.retry
+        self.report.failed_plans += 1
+        self.report.message = f"{fresh.status.value}: {fresh.message}"
+        logger.info("no plan: %s", self.report.message)
+        return None
+
+    def _attainable(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"]) -> Float[Tensor, "2"]:
+        """The goal, or while it is blocked on the map the nearest free place to it."""
+        rings = torch.arange(0.1, self.config.detour + 0.05, 0.1)
+        angles = torch.arange(0, 2 * math.pi, math.pi / 12)
+        circle = torch.stack([angles.cos(), angles.sin()], dim=-1)
+        around = goal + (rings[:, None, None] * circle).reshape(-1, 2)
+        # Of equally near places the one on the robot's side comes first.
+        by_distance = torch.argsort(
+            (around - goal).norm(dim=1).round(decimals=2) * 100 + (around - start).norm(dim=1)
+        )
+        places = torch.cat([goal[None], around[by_distance]])
+        clearance = self._clearance(places)
+        free = clearance >= torch.tensor(
+            [self.config.least_margin] + [self.config.margin] * (len(places) - 1)
+        )
+        return places[int(free.float().argmax())] if bool(free.any()) else goal
+
+    def _clearance(self, places: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+        """Clearance [m] of the body at positions, by the rules of the dense check."""
+        assert self.field is not None
+        validation = self.config.planner.chomp.validation
+        workspace = Workspace(self.body, self.field, eps=1.0, config=validation.workspace)
+        return workspace.clearance(*self.body.spheres(places)).amin(dim=-1)
+
+    def _still_good(self, target: Float[Tensor, "2"]) -> bool:
+        """Whether the plan still leads to the target, and what is left of it keeps its clearance on the new map."""
         if self.plan is None or self.field is None:
+            return False
+        if float((self.plan.trajectory.waypoints[-1] - target).norm()) > 0.25:
             return False
         left = self._remaining(self.plan.trajectory)
         clearance = check(self.body, left, self.field, self.config.planner.chomp.validation).clearance
         wanted = min(self.config.margin, self.plan.clearance) - self.config.clearance_change
         return clearance >= max(wanted, self.config.least_margin)
 
-    def _planned(self, goal: Float[ndarray, "2"]) -> PlanResult:
+    def _planned(self, start: Float[Tensor, "2"], target: Float[Tensor, "2"]) -> PlanResult:
+        """Plan with as much clearance as start and target have themselves; the cost still seeks more."""
         assert self.field is not None
         config = self.config
-        start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
-        end = torch.as_tensor(goal, dtype=torch.float32)
-        lenient = replace(config.planner.chomp.validation, margin=config.least_margin)
-        # Where start or goal are tight, the whole plan is held to what they have; its cost still seeks room.
-        margin = config.margin
-        for q in (start, end):
-            standing = check(self.body, Trajectory(q[None], torch.zeros(1)), self.field, lenient)
-            margin = min(margin, standing.clearance - 0.005)
-        margin = max(margin, config.least_margin)
-        planner = Planner(self.body, _with_margin(config.planner, margin, lenient), self.seed)
+        margin = min(config.margin, float(self._clearance(torch.stack([start, target])).min()) - 0.005)
+        planner = Planner(
+            self.body, _with_margin(config.planner, max(margin, config.least_margin)), self.seed
+        )
         warm = None if self.plan is None else self._remaining(self.plan.trajectory)
         if warm is not None and len(warm) > 2:
             warm = Trajectory.through(warm.waypoints, config.planner.num_waypoints, config.planner.duration)
-        return planner.plan(start, end, self.field, warm)
+        return planner.plan(start, target, self.field, warm)
 
     def _remaining(self, trajectory: Trajectory) -> Trajectory:
         """The part of a path ahead of the base, starting where the base stands."""
@@ -294,9 +338,8 @@ class ReplanningLoop:
     def _follow(self, duration: float, final_yaw: float | None) -> None:
         """Let time pass on the plan; without one, turn on the spot to see more."""
         if self.plan is None:
-            rate = 0.5 * self.config.tracker.max_yaw_rate
             self._ahead(self.robot.base_state())
-            self._pass_time(duration, lambda _: (0.0, rate))
+            self._pass_time(duration, lambda _: (0.0, self.config.scan_rate))
             return
         path = self.plan.trajectory.waypoints.numpy().astype(float)
 
@@ -336,12 +379,10 @@ class ReplanningLoop:
         logger.info("drive ended: %s (%s)", status.value, message)
 
 
-def _with_margin(planner: PlannerConfig, margin: float, validation: ValidationConfig) -> PlannerConfig:
+def _with_margin(planner: PlannerConfig, margin: float) -> PlannerConfig:
     """The planner held to another clearance [m]."""
     return replace(
         planner,
-        chomp=replace(planner.chomp, validation=replace(validation, margin=margin)),
+        chomp=replace(planner.chomp, validation=replace(planner.chomp.validation, margin=margin)),
         rrt=replace(planner.rrt, margin=margin + 0.01, min_margin=margin),
     )
-
-

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from isdf import DepthFrame, PinholeCamera, SamplingConfig
-from isdf.bounds import BOUNDS, batch_bound, nearest, normal_bound, ray_bound, supervise
+from isdf.bounds import BOUNDS, _nearest_by_product, batch_bound, nearest, normal_bound, ray_bound, supervise
 from isdf.sampling import normals_at, sample_rays, valid_normals
 from tests.isdf.rooms import ball, furnished_orbit, furnished_room, look_at, render
 
@@ -136,10 +136,11 @@ def test_invalid_and_far_pixels_are_never_drawn() -> None:
     torch.testing.assert_close(batch.points[:, 0, 2], torch.ones(20))
 
 
-def test_nearest_equals_brute_force_far_from_the_origin() -> None:
+@pytest.mark.parametrize("search", [nearest, _nearest_by_product])
+def test_nearest_equals_brute_force_far_from_the_origin(search) -> None:
     offset = torch.tensor([300.0, -200.0, 50.0])
     points = torch.rand(400, 3, generator=generator(1)) * 4 + offset
     targets = torch.rand(300, 3, generator=generator(2)) * 4 + offset
     distance = torch.cdist(points.double(), targets.double())
-    found = distance.gather(1, nearest(points, targets)[:, None])[:, 0]
+    found = distance.gather(1, search(points, targets)[:, None])[:, 0]
     torch.testing.assert_close(found, distance.amin(dim=1), atol=1e-4, rtol=0)
