@@ -91,8 +91,13 @@ def test_seen_points_lie_on_the_surfaces_of_the_ground_truth(name):
 def test_culling_by_bounding_balls_changes_no_pixel():
     rng = np.random.default_rng(0)
     balls = [
-        Sphere(f"b{i}", planar_pose(*rng.uniform(-2, 2, 3)), float(rng.uniform(0.05, 0.6)), mass=1.0)
-        for i in range(25)
+        Sphere(
+            f"b{i}",
+            planar_pose(*rng.uniform([-1, -2, -1], [4, 2, 1])),
+            float(rng.uniform(0.05, 0.3)),
+            mass=1.0,
+        )
+        for i in range(40)
     ]
     fixed = tuple(Sphere(b.name, b.pose, b.radius) for b in balls)
     for pose in (_looking([0.0, 0.0, 0.0], 0.3, 0.2), _looking([-2.5, 1.0, 0.5], -0.4, 0.1)):

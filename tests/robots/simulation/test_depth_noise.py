@@ -33,7 +33,9 @@ def test_disparity_noise_is_unbiased_and_grows_with_depth_squared():
 
 def test_quantisation_steps_grow_with_depth_squared():
     ramp = np.linspace(1.0, 4.0, 200 * 300, dtype=np.float32).reshape(200, 300)
-    measured = np.unique(_noise(disparity_step=0.125)(ramp, np.random.default_rng(0)))
+    image = _noise(disparity_step=0.125)(ramp, np.random.default_rng(0))
+    assert abs((image - ramp).mean()) < 1e-3, "rounded to the nearest step, not downwards"
+    measured = np.unique(image)
     steps, middle = np.diff(measured), (measured[1:] + measured[:-1]) / 2
     np.testing.assert_allclose(steps, 0.125 / 35.13 * middle**2, rtol=0.02)
 
@@ -59,12 +61,12 @@ def test_jitter_only_swaps_depths_near_edges():
 
 
 def test_invalid_stays_invalid_and_range_is_kept():
-    depth = np.random.default_rng(0).uniform(0.3, 8.0, (120, 160)).astype(np.float32)
+    depth = np.random.default_rng(0).uniform(0.3, 8.0, (480, 640)).astype(np.float32)
     depth[40:60, 50:90] = 0.0
     measured = DepthNoise()(depth, np.random.default_rng(1))
-    assert (measured[40:60, 50:90] == 0).all()
+    assert (measured[40:60, 50:90] == 0).all(), "at the full resolution the jitter moves pixels"
     assert measured.max() <= 5.0 and (measured >= 0).all() and np.isfinite(measured).all()
-    assert (measured[depth > 6.0] == 0).mean() > 0.9
+    assert (measured[depth > 6.0] == 0).mean() > 0.8
     assert measured.dtype == np.float32
     assert (DepthNoise()(np.zeros((4, 5), np.float32), np.random.default_rng(0)) == 0).all()
 
