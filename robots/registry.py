@@ -91,8 +91,8 @@ def _load_panda() -> Robot:
 
 
 # Torso [m], then the seven arm joints [rad].
-TIAGO_TUCKED = (0.15, 0.20, -1.34, -0.20, 1.94, -1.57, 1.37, 0.0)
-TIAGO_READY = (0.20, 1.50, -0.60, -3.00, 1.90, -1.57, 0.0, 0.0)
+TIAGO_TUCKED = (0.20, 1.90, -1.50, 1.09, 2.30, -0.24, 0.70, 1.13)
+TIAGO_READY = (0.25, 2.2, 0.85, 1.38, 1.53, -0.46, 1.12, 0.7)
 PANDA_READY = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 
 _LOADERS: dict[str, Callable[[], Robot]] = {"tiago": _load_tiago, "panda": _load_panda}
