@@ -4,7 +4,9 @@ from robots.simulation.base import DifferentialDrive, DriveConfig
 from robots.simulation.camera import DepthCamera, DepthFrame, PinholeCamera
 from robots.simulation.contacts import Contact
 from robots.simulation.depth_noise import DepthNoise, DepthNoiseConfig
+from robots.simulation.mobile_robot import SimulatedMobileRobot
 from robots.simulation.primitives import Box, Cylinder, Primitive, Sphere
+from robots.simulation.recording import Recording
 from robots.simulation.rooms import GraspTask
 from robots.simulation.scene_sdf import SceneField
 from robots.simulation.scenes import Scene, available_scenes, load_urdf_scene, make_scene
@@ -25,8 +27,10 @@ __all__ = [
     "MotorConfig",
     "PinholeCamera",
     "Primitive",
+    "Recording",
     "Scene",
     "SceneField",
+    "SimulatedMobileRobot",
     "SimulatedRobot",
     "Sphere",
     "World",

@@ -36,6 +36,10 @@ class Recording:
         self._poses.append(np.array([self.world.object_pose(n) for n in self._movable]).reshape(-1, 4, 4))
         self.contacts += [(self.world.time, contact) for contact in self.world.contacts()]
 
+    def first_base_pose(self) -> np.ndarray:
+        """The first three joint positions recorded: where a mobile base started [m, m, rad]."""
+        return self._postures[0][:3]
+
     def touched(self, ignore: tuple[str, ...] = ()) -> dict[str, float]:
         """Deepest penetration [m] of each pair "link - body" that touched, but for the named bodies."""
         deepest: dict[str, float] = {}
@@ -46,9 +50,11 @@ class Recording:
         return deepest
 
     def save(self, path: str | Path) -> None:
-        """Write an .npz: time (n,) [s], joint_names, joint_positions (n, dof), object_names, object_poses
-        (n, k, 4, 4) [m], and base_pose (n, 3) [m, m, rad] where the robot has a base.
-        """  # noqa: D205
+        """Write the states to an .npz file.
+
+        It holds time (n,) [s], joint_names, joint_positions (n, dof), object_names, object_poses (n, k, 4, 4) [m],
+        and base_pose (n, 3) [m, m, rad] where the robot has a base.
+        """
         names = self.world.robot.joint_names
         postures = np.array(self._postures).reshape(len(self), len(names))
         arrays = {
@@ -60,4 +66,4 @@ class Recording:
         }
         if names[:3] == ("base_x", "base_y", "base_yaw"):
             arrays["base_pose"] = postures[:, :3]
-        np.savez_compressed(path, **arrays)
+        np.savez_compressed(path, **arrays)  # type: ignore[arg-type]

@@ -140,7 +140,7 @@ def test_map_then_query(sequence_dir, tmp_path, monkeypatch, capsys) -> None:
     assert report["steps"] == 96 and report["frames_used"] == 12
     assert len(trimesh.load(out / "mesh.ply").faces) == report["mesh_faces"] > 100
     assert Image.open(out / "slices.png").size[0] > 500
-    points = np.random.default_rng(0).uniform(-1, 1, (100, 3)) + [0, 0, 1]
+    points = np.random.default_rng(0).uniform(-1, 1, (100, 3)) + np.array([0, 0, 1])
     np.save(tmp_path / "points.npy", points)
     run_cli(monkeypatch, "query", out, "--points", tmp_path / "points.npy", "--out", tmp_path / "answers.npz")
     answers = np.load(tmp_path / "answers.npz")

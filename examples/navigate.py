@@ -1,0 +1,126 @@
+"""A mobile manipulator enters a furnished room it has never seen, maps it and drives to a goal across it.
+
+    python -m examples.navigate --out runs/navigate --scene apartment --seed 0
+
+Leaves report.json, states.npz (every executed step), map.png, mesh.ply, map.safetensors and episode.gif. Success and
+contacts are read from the physics.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+from examples.episode import Episode, EpisodeOptions
+from examples.pictures import Film, save_map_picture
+from isdf.meshing import zero_level_mesh
+from planning.replanning import DriveReport, ReplanningConfig, ReplanningLoop
+
+
+@dataclass(frozen=True)
+class Navigate(EpisodeOptions):
+    """Map an unknown furnished room and drive to a goal in it."""
+
+    start: tuple[float, float, float] | None = None
+    """Base pose x, y [m] and yaw [rad]; by default the scene's own."""
+    goal: tuple[float, float] | None = None
+    """x, y [m]; by default the scene's own."""
+    film: bool = True
+    """Make the GIF; it takes about half a minute."""
+
+
+def main(options: Navigate) -> dict:
+    """Run one episode and write its results; returns the report."""
+    torch.set_num_threads(1)
+    episode = Episode(options, options.start)
+    goal = np.array(options.goal or (episode.scene.goal or _no_goal(options))[:2])
+    film = Film(episode, goal, least_gap=1.0 if options.film else np.inf)
+    started = time.perf_counter()
+    with tqdm(desc="driving", unit=" rounds", disable=None) as bar:
+
+        def watch(loop: ReplanningLoop) -> None:
+            film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy())
+            left = np.linalg.norm(episode.robot.base_state()[:2] - goal)
+            bar.set_postfix_str(f"t = {episode.robot.time:.0f} s, {left:.1f} m to go, {episode.mapper.steps} steps")
+            bar.update()
+
+        loop = ReplanningLoop(
+            episode.robot,
+            episode.body,
+            episode.mapper,
+            episode.field_for_driving,
+            ReplanningConfig(),
+            options.clock(),
+            watch,
+            options.seed,
+        )
+        drive = loop.drive_to(goal)
+    report = _report(options, episode, goal, drive, time.perf_counter() - started)
+    _write(options, episode, film, goal, report)
+    episode.close()
+    return report
+
+
+def _report(
+    options: Navigate, episode: Episode, goal: np.ndarray, drive: DriveReport, wall_seconds: float
+) -> dict:
+    contacts = episode.contacts()
+    start = episode.robot.recording.first_base_pose()
+    return {
+        "example": "navigate",
+        "scene": options.scene,
+        "seed": options.seed,
+        "success": drive.success and drive.goal_distance < 0.1,
+        "contacts": len(contacts),
+        "contact_pairs": contacts,
+        "straight_line": float(np.linalg.norm(start[:2] - goal)),
+        "goal": goal.tolist(),
+        "drive": dataclasses.asdict(drive) | {"status": drive.status.value},
+        "map": {
+            "steps": episode.mapper.steps,
+            "keyframes": len(episode.mapper.keyframes),
+            "sdf_error": _map_error(episode),
+        },
+        "wall_seconds": wall_seconds,
+    }
+
+
+def _map_error(episode: Episode) -> dict[str, float] | None:
+    """Mean and 95th percentile of |learned - true| distance [m] in the free space a robot moves in."""
+    if not episode.world.solids:
+        return None
+    low, high = episode.mapper.bounds
+    generator = torch.Generator().manual_seed(0)
+    points = low + (high - low) * torch.rand(20_000, 3, generator=generator)
+    truth = episode.world.field().distance(points)
+    free = (truth > 0) & (points[:, 2] > 0) & (points[:, 2] < 1.5)
+    error = (episode.mapper.field().distance(points[free]) - truth[free]).abs()
+    return {"mean": float(error.mean()), "p95": float(error.quantile(0.95))}
+
+
+def _write(options: Navigate, episode: Episode, film: Film, goal: np.ndarray, report: dict) -> None:
+    out = options.out
+    out.mkdir(parents=True, exist_ok=True)
+    episode.robot.recording.save(out / "states.npz")
+    episode.mapper.save(out / "map.safetensors")
+    zero_level_mesh(episode.mapper.field(), 0.05).export(out / "mesh.ply")
+    save_map_picture(out / "map.png", episode, np.array(film.path).reshape(-1, 2), goal)
+    if options.film:
+        film.save(out / "episode.gif")
+    (out / "report.json").write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _no_goal(options: Navigate) -> tuple[float, float]:
+    raise SystemExit(f"{options.scene} has no goal of its own: give --goal X Y")
+
+
+if __name__ == "__main__":
+    outcome = main(tyro.cli(Navigate))
+    print(json.dumps({k: outcome[k] for k in ("success", "contacts", "drive", "map")}, indent=1))

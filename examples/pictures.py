@@ -1,0 +1,131 @@
+"""Pictures of a closed-loop episode: the map with plan and path, and a short film."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from examples.episode import Episode, base_outline
+
+SLICE_HEIGHT = 0.5
+COLOUR_LIMIT = 1.0
+
+
+class Film:
+    """Collects frames of an episode and writes them as a GIF.
+
+    Args:
+        episode: what is filmed.
+        goal: x, y [m] to mark.
+        least_gap: simulated seconds between two frames.
+    """
+
+    def __init__(self, episode: Episode, goal: np.ndarray, least_gap: float = 1.0) -> None:
+        self.episode, self.goal, self.least_gap = episode, goal, least_gap
+        self.path: list[np.ndarray] = []
+        self._frames: list[Image.Image] = []
+        self._last = -np.inf
+
+    def add(self, plan: np.ndarray | None = None) -> None:
+        """Take a frame now if the last one is old enough; `plan` is (n, 2) positions [m]."""
+        robot = self.episode.robot
+        self.path.append(robot.base_state()[:2])
+        if robot.time - self._last < self.least_gap:
+            return
+        self._last = robot.time
+        figure = Figure(figsize=(9.6, 3.9), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        draw_map(left, self.episode, np.array(self.path), plan, self.goal, spacing=0.08)
+        left.set_title(f"map at {SLICE_HEIGHT} m, t = {robot.time:.0f} s")
+        right.imshow(overview(self.episode))
+        right.set_axis_off()
+        self._frames.append(_rendered(figure))
+
+    def save(self, path: Path) -> None:
+        """Write the GIF, at most 60 frames of it."""
+        frames = self._frames[:: max(1, len(self._frames) // 60)]
+        if frames:
+            small = [f.quantize(192, Image.Quantize.MAXCOVERAGE) for f in frames]
+            small[0].save(path, save_all=True, append_images=small[1:], duration=180, loop=0, optimize=True)
+
+
+def save_map_picture(path: Path, episode: Episode, driven: np.ndarray, goal: np.ndarray) -> None:
+    """The learned slice beside the true one, each with the driven path; and the room from above."""
+    figure = Figure(figsize=(15, 4), layout="constrained")
+    learned, true, photo = figure.subplots(1, 3)
+    image = draw_map(learned, episode, driven, None, goal)
+    learned.set_title(f"learned signed distance at {SLICE_HEIGHT} m")
+    if episode.world.solids:
+        draw_map(true, episode, driven, None, goal, truth=True)
+        true.set_title("ground truth")
+    else:
+        true.set_axis_off()
+    figure.colorbar(image, ax=[learned, true], label="[m]", shrink=0.8)
+    photo.imshow(overview(episode, 960, 720))
+    photo.set_axis_off()
+    figure.savefig(path, dpi=110)
+
+
+def draw_map(axes, episode: Episode, driven, plan, goal, spacing: float = 0.03, truth: bool = False):
+    """One slice of the map with the robot, its way so far (red), its plan (green) and the goal (star)."""
+    (x0, y0, _), (x1, y1, _) = episode.mapper.bounds.numpy()
+    xs, ys = np.arange(x0, x1, spacing), np.arange(y0, y1, spacing)
+    points = np.stack([*np.meshgrid(xs, ys), np.full((len(ys), len(xs)), SLICE_HEIGHT)], axis=-1)
+    field = episode.world.field() if truth else episode.mapper.field()
+    distance = field.distance(torch.from_numpy(points.astype(np.float32))).numpy()
+    image = axes.imshow(
+        distance,
+        origin="lower",
+        extent=(x0, x1, y0, y1),
+        cmap="coolwarm_r",
+        vmin=-COLOUR_LIMIT,
+        vmax=COLOUR_LIMIT,
+    )
+    axes.contour(xs, ys, distance, levels=[0.0], colors="black", linewidths=1.0)
+    for x, y, radius in base_outline(episode.model, episode.robot.posture()):
+        axes.add_patch(_disc(x, y, radius))
+    if len(driven):
+        axes.plot(driven[:, 0], driven[:, 1], color="red", linewidth=1.5)
+    if plan is not None:
+        axes.plot(plan[:, 0], plan[:, 1], color="limegreen", linewidth=1.5)
+    axes.plot(*goal[:2], "*", color="gold", markersize=14, markeredgecolor="black")
+    axes.set_aspect("equal")
+    return image
+
+
+def overview(episode: Episode, width: int = 480, height: int = 360) -> np.ndarray:
+    """The room and the robot from obliquely above, (height, width, 3) uint8."""
+    low, high = episode.mapper.bounds.numpy()
+    centre, span = (low + high) / 2, float((high - low)[:2].max())
+    eye = centre + np.array([0.0, -0.45 * span, 1.05 * span])
+    view = pybullet.computeViewMatrix(eye.tolist(), [centre[0], centre[1], 0.3], [0, 0, 1])
+    projection = pybullet.computeProjectionMatrixFOV(50, width / height, 0.1, 60)
+    shown = pybullet.getCameraImage(
+        width,
+        height,
+        view,
+        projection,
+        lightDirection=[2, -3, 6],
+        flags=pybullet.ER_NO_SEGMENTATION_MASK,
+        renderer=pybullet.ER_TINY_RENDERER,
+        physicsClientId=episode.world.client,
+    )
+    return np.reshape(shown[2], (height, width, 4))[:, :, :3].astype(np.uint8)
+
+
+def _disc(x: float, y: float, radius: float):
+    from matplotlib.patches import Circle
+
+    return Circle((x, y), radius, facecolor="orange", edgecolor="none", alpha=0.6, zorder=5)
+
+
+def _rendered(figure: Figure) -> Image.Image:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
