@@ -43,10 +43,11 @@ def tiago_urdf() -> Path:
     """Compose TIAGo without a hand, the Franka hand and a planar base into one URDF in the user's cache."""
     data = example_robot_data()
     hand = extract_subtree(data / "panda_description" / "urdf" / "panda.urdf", "panda_hand")
-    # The tool flange's x axis points out of the wrist, the hand's z axis along its fingers; the back of the
-    # hand, 26 mm behind its origin, sits on the 5 mm flange.
+    # The tool flange's x axis points out of the wrist, the hand's z axis along its fingers. The hand's flange
+    # ends 2.5 mm behind its origin, the wrist's 5 mm ahead of its own; the rest keeps the hand's wings, which
+    # reach 26 mm back on both sides, clear of the last joint.
     mounted = Attachment(
-        hand, "wrist_ft_tool_link", "panda_hand", xyz=(0.031, 0.0, 0.0), rpy=(0.0, math.pi / 2, 0.0)
+        hand, "wrist_ft_tool_link", "panda_hand", xyz=(0.01, 0.0, 0.0), rpy=(0.0, math.pi / 2, 0.0)
     )
     body = data / "tiago_description" / "robots" / "tiago_no_hand.urdf"
     return compose(body, [mounted], planar_base=PlanarBase(velocity=0.6, yaw_velocity=1.0), name="tiago")
@@ -91,8 +92,8 @@ def _load_panda() -> Robot:
 
 
 # Torso [m], then the seven arm joints [rad].
-TIAGO_TUCKED = (0.20, 1.90, -1.50, 1.09, 2.30, -0.24, 0.70, 1.13)
-TIAGO_READY = (0.25, 2.2, 0.85, 1.38, 1.53, -0.46, 1.12, 0.7)
+TIAGO_TUCKED = (0.15, 1.95, -1.50, 1.07, 2.29, 0.28, 0.93, 0.98)
+TIAGO_READY = (0.25, 2.18, 0.82, 1.34, 1.53, -0.44, 1.08, 0.68)
 PANDA_READY = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 
 _LOADERS: dict[str, Callable[[], Robot]] = {"tiago": _load_tiago, "panda": _load_panda}

@@ -41,6 +41,7 @@ def fit_robot(
     skip: Collection[str] = (),
     lowest: Mapping[str, float] | None = None,
     floor_links: Collection[str] = (),
+    ignored_pairs: Collection[tuple[str, str]] = (),
     config: RobotFitConfig | None = None,
 ) -> tuple[SphereSet, dict[str, SphereFit]]:
     """Cover every link with collision geometry by spheres, at most `budget` in all.
@@ -54,6 +55,7 @@ def fit_robot(
         skip: links to leave out, e.g. wheels inside of the base's outline.
         lowest: per link, the height [m, link frame] below which no sphere of its body may reach.
         floor_links: links that drive on the floor.
+        ignored_pairs: link pairs known to need no self-collision test, beside those found.
         config: how the budget is shared out.
 
     Returns the sphere set, with the link pairs that need no test already marked, and the quality of the
@@ -81,7 +83,8 @@ def fit_robot(
         rows.update(body.spheres_by_link(fit.spheres))
     spheres = SphereSet(rows, floor_links=frozenset(floor_links) & set(rows))
     robot = Robot.from_urdf(urdf, spheres)
-    return replace(spheres, ignored_pairs=untested_pairs(robot, config)), report
+    known = frozenset(frozenset(pair) for pair in ignored_pairs)
+    return replace(spheres, ignored_pairs=known | untested_pairs(robot, config)), report
 
 
 class _Body:

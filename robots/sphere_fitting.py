@@ -23,6 +23,7 @@ SURFACE_POINTS = 10_000
 COVER_POINTS = 1_500  # surface points that the greedy cover must contain
 CANDIDATES = 1_600  # random interior ball centres it chooses from
 GROWTH_POINTS = 30_000  # surface points that the final radii must contain
+HEIGHT_RESERVE = 0.01  # [m] kept above the height limit for the final growth of the radii
 RESTARTS = 4  # perturbed repetitions of the greedy cover
 
 
@@ -176,7 +177,8 @@ class BallCover:
 
     def __init__(self, shape: Shape, lowest: float | None = None) -> None:
         self.shape = shape
-        self._lowest = -math.inf if lowest is None else lowest
+        self._floor = -math.inf if lowest is None else lowest
+        self._lowest = self._floor + HEIGHT_RESERVE
         self._centres = shape.interior_points(CANDIDATES)
         self._depths = shape.distance(self._centres)
         self._points = np.concatenate([shape.surface_points(COVER_POINTS), self._centres[::5]])
@@ -203,7 +205,7 @@ class BallCover:
                 f"no spheres that protrude at most {overshoot:.3f} m cover the shape; allow more, or a lower `lowest`"
             )
         spheres = self._shrunk(chosen, overshoot)
-        return self._measured(_grown_to(spheres, self.shape.surface_points(GROWTH_POINTS), self._lowest))
+        return self._measured(_grown_to(spheres, self.shape.surface_points(GROWTH_POINTS), self._floor))
 
     def _radii(self, overshoot: float) -> np.ndarray:
         return np.minimum(self._depths + overshoot, self._centres[:, 2] - self._lowest)

@@ -20,7 +20,7 @@ class SphereSet:
     """Spheres that cover a robot.
 
     `spheres` maps a link to rows (n, 4) of centre [m, link frame] and radius [m]; `ignored_pairs` are
-    the link pairs whose contact is not a self-collision; `floor_links` drive on the floor, so that
+    the link pairs whose contact is not a self-collision; `floor_links` drive or stand on the floor, so that
     their spheres are always near it.
     """
 
