@@ -34,7 +34,7 @@ def remove_robot(
     camera: Camera,
     T_world_camera: Float[np.ndarray, "4 4"],
     centres: Float[np.ndarray, "s 3"] | Float[Tensor, "s 3"],
-    radii: Float[np.ndarray, " s"] | Float[Tensor, " s"],
+    radii: Float[np.ndarray, " radii"] | Float[Tensor, " radii"],
     margin: float = 0.03,
 ) -> Float[np.ndarray, "h w"]:
     """Depth image with the pixels that see the robot set to 0 (invalid).

@@ -80,5 +80,5 @@ def test_the_arm_is_removed_from_tiagos_own_view() -> None:
 
 
 def test_shapes_are_checked() -> None:
-    with pytest.raises((robots.RobotError, TypeError, Exception)):
+    with pytest.raises(robots.RobotError, match=r"radii \(3,\)"):
         robots.remove_robot(np.zeros((4, 4)), CAMERA, np.eye(4), np.zeros((2, 3)), np.zeros(3))
