@@ -74,7 +74,7 @@ def _sweep_within(rows: np.ndarray, max_spheres: int) -> np.ndarray:
     """The finest sweep (n, 4) with at most `max_spheres`."""
     profile = _Profile(rows)
     # How far spheres may protrude from the swept volume [m], from fine to coarse.
-    for slack in (0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.12):
+    for slack in (0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.12):
         spheres = profile.cover(slack)
         if len(spheres) <= max_spheres:
             return spheres
@@ -90,7 +90,7 @@ class _Profile:
     is the same set cover as that of a link by balls.
     """
 
-    def __init__(self, rows: np.ndarray, spacing: float = 0.008) -> None:
+    def __init__(self, rows: np.ndarray, spacing: float = 0.006) -> None:
         discs = np.column_stack([np.hypot(rows[:, 0], rows[:, 1]), rows[:, 2], rows[:, 3]])
         # A point of the section is within half a cell's diagonal of a grid point of the section grown by that.
         self._error = spacing / np.sqrt(2)
