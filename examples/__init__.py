@@ -1,0 +1,1 @@
+"""Closed-loop examples: the only place where maps, planner and robots meet."""

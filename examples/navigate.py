@@ -48,7 +48,9 @@ def main(options: Navigate) -> dict:
         def watch(loop: ReplanningLoop) -> None:
             film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy())
             left = np.linalg.norm(episode.robot.base_state()[:2] - goal)
-            bar.set_postfix_str(f"t = {episode.robot.time:.0f} s, {left:.1f} m to go, {episode.mapper.steps} steps")
+            bar.set_postfix_str(
+                f"t = {episode.robot.time:.0f} s, {left:.1f} m to go, {episode.mapper.steps} steps"
+            )
             bar.update()
 
         loop = ReplanningLoop(

@@ -16,23 +16,20 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from torch import Tensor
 
-from planning.chomp import ChompConfig
+from planning.chomp import Chomp, ChompConfig
 from planning.clock import Clock, MeasuredClock, OnlineMap
 from planning.errors import ConfigError
-from planning.initialise import RrtConfig
-from planning.plan import Planner, PlannerConfig
+from planning.grid_search import GridSearchConfig, Route, grid_search
 from planning.protocols import DistanceField, SphereRobot
 from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
 from planning.trajectory import Trajectory
 from planning.validation import ValidationConfig, check
-from planning.workspace import Workspace, WorkspaceConfig
+from planning.workspace import WorkspaceConfig
 
 logger = logging.getLogger(__name__)
 
-# A map still being learned has the floor some centimetres wrong.
 LEARNED_FLOOR = WorkspaceConfig(floor_tolerance=0.10)
 
 
@@ -67,48 +64,47 @@ class ReplanningConfig:
     """How the loop drives.
 
     Args:
-        planner: the path planner; its margins are set by the loop.
+        search: finds the route that CHOMP starts from.
+        chomp: the optimiser; its margin is set by the loop.
         tracker: the base controller.
-        margin: clearance [m] that plans keep where start and goal allow it.
-        least_margin: clearance [m] of start or goal below which they count as blocked. Negative, because a map
-            still being learned is some centimetres wrong and the robot stands where it stands.
+        num_waypoints: of a plan.
+        margin: clearance [m] that plans keep where the map has a route with as much.
         clearance_change: a plan is made anew when the map has taken this much [m] of its clearance.
         scan: angle [rad] turned on the spot at the start, to see what is around.
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
-        detour: while the goal is blocked on the map, the nearest free place within this distance [m] of it is driven
-            to; the map there may be wrong until it is seen from near.
         look_ahead: distance along the path [m] at which the camera looks.
         patience: plans in a row that may fail before the goal is called unreachable.
         time_limit: [s] of the robot's time.
     """
 
-    planner: PlannerConfig = field(
-        default_factory=lambda: PlannerConfig(
-            num_waypoints=40,
-            chomp=ChompConfig(
-                eps=0.35, max_iterations=120, validation=ValidationConfig(workspace=LEARNED_FLOOR)
-            ),
-            rrt=RrtConfig(seconds=1.5, workspace=LEARNED_FLOOR),
+    # A map still being learned is some centimetres wrong, also about the floor, and the robot stands where it stands:
+    # hence the generous floor tolerance and the negative least margin.
+    search: GridSearchConfig = field(
+        default_factory=lambda: GridSearchConfig(least_margin=-0.10, workspace=LEARNED_FLOOR)
+    )
+    chomp: ChompConfig = field(
+        default_factory=lambda: ChompConfig(
+            eps=0.35, max_iterations=120, validation=ValidationConfig(workspace=LEARNED_FLOOR)
         )
     )
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    num_waypoints: int = 40
     margin: float = 0.05
-    least_margin: float = -0.10
     clearance_change: float = 0.05
     scan: float = 2 * math.pi
     scan_rate: float = 0.5
     retry: float = 1.0
-    detour: float = 1.5
     look_ahead: float = 1.5
     patience: int = 15
     time_limit: float = 180.0
 
     def __post_init__(self) -> None:
-        if self.least_margin > self.margin or self.clearance_change <= 0 or self.time_limit <= 0:
+        positive = (self.clearance_change, self.scan_rate, self.retry, self.time_limit)
+        if min(positive) <= 0 or self.num_waypoints < 3 or self.margin < self.search.least_margin:
             raise ConfigError(
-                "ReplanningConfig: least_margin <= margin, clearance_change > 0 and time_limit > 0 are needed, got "
-                f"{self.least_margin:g}, {self.margin:g}, {self.clearance_change:g} m and {self.time_limit:g} s."
+                "ReplanningConfig: clearance_change, scan_rate, retry and time_limit must be positive, num_waypoints "
+                f"at least 3 and margin at least search.least_margin, got {self}."
             )
 
 
@@ -182,7 +178,7 @@ class ReplanningLoop:
         self._owed = 0.0
         self._failures = 0
         self._retry_at = -math.inf
-        self._at_goal = False
+        self._to_goal = False
 
     def drive_to(self, goal: Float[ndarray, "2"], final_yaw: float | None = None) -> DriveReport:
         """Look around, then map, plan and drive until the goal is reached or given up.
@@ -202,7 +198,7 @@ class ReplanningLoop:
             self.report.rounds += 1
             if self.watch:
                 self.watch(self)
-            if self.plan is not None and self.tracker.finished and self._at_goal:
+            if self.plan is not None and self.tracker.finished and self._to_goal:
                 self._end(DriveStatus.REACHED, "the base stands on the goal")
                 break
             if self._failures > self.config.patience:
@@ -264,69 +260,65 @@ class ReplanningLoop:
     def _decide(self, goal: Float[ndarray, "2"]) -> PlanResult | None:
         """Keep the plan while it is good; else make one, to the goal or as near to it as the map allows."""
         self.field = self.snapshot()
-        start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
-        target = self._attainable(start, torch.as_tensor(goal, dtype=torch.float32))
-        if self._still_good(target):
-            return self.plan
-        fresh = self._planned(start, target)
+        if self._still_good():
+            if self._to_goal:
+                return self.plan
+            if not self._route(goal).reaches_goal and not self.tracker.finished:
+                return self.plan
+        fresh, to_goal = self._planned(goal)
         self.report.plans += 1
-        if fresh.success:
-            self._failures, self._at_goal = 0, bool(torch.allclose(target, torch.as_tensor(goal).to(target)))
+        dead_end = fresh.success and not to_goal and fresh.trajectory.joint_path_length < 0.2
+        if fresh.success and not dead_end:
+            self._failures, self._to_goal = 0, to_goal
             return fresh
         self._failures += 1
         self._retry_at = self.robot.time + self.config.retry
         self.report.failed_plans += 1
-        self.report.message = f"{fresh.status.value}: {fresh.message}"
+        self.report.message = (
+            "no way leads nearer to the goal" if dead_end else f"{fresh.status.value}: {fresh.message}"
+        )
         logger.info("no plan: %s", self.report.message)
         return None
 
-    def _attainable(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"]) -> Float[Tensor, "2"]:
-        """The goal, or while it is blocked on the map the nearest free place to it."""
-        rings = torch.arange(0.1, self.config.detour + 0.05, 0.1)
-        angles = torch.arange(0, 2 * math.pi, math.pi / 12)
-        circle = torch.stack([angles.cos(), angles.sin()], dim=-1)
-        around = goal + (rings[:, None, None] * circle).reshape(-1, 2)
-        # Of equally near places the one on the robot's side comes first.
-        by_distance = torch.argsort(
-            (around - goal).norm(dim=1).round(decimals=2) * 100 + (around - start).norm(dim=1)
-        )
-        places = torch.cat([goal[None], around[by_distance]])
-        clearance = self._clearance(places)
-        free = clearance >= torch.tensor(
-            [self.config.least_margin] + [self.config.margin] * (len(places) - 1)
-        )
-        return places[int(free.float().argmax())] if bool(free.any()) else goal
-
-    def _clearance(self, places: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-        """Clearance [m] of the body at positions, by the rules of the dense check."""
+    def _route(self, goal: Float[ndarray, "2"]) -> Route:
         assert self.field is not None
-        validation = self.config.planner.chomp.validation
-        workspace = Workspace(self.body, self.field, eps=1.0, config=validation.workspace)
-        return workspace.clearance(*self.body.spheres(places)).amin(dim=-1)
+        start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
+        end = torch.as_tensor(goal, dtype=torch.float32)
+        return grid_search(self.body, self.field, start, end, self.config.search)
 
-    def _still_good(self, target: Float[Tensor, "2"]) -> bool:
-        """Whether the plan still leads to the target, and what is left of it keeps its clearance on the new map."""
+    def _planned(self, goal: Float[ndarray, "2"]) -> tuple[PlanResult, bool]:
+        """CHOMP from the best route, or the route itself where CHOMP leaves it; and whether it leads to the goal.
+
+        The clearance asked for is what the route has, at most the margin; the cost still seeks more.
+        """
+        assert self.field is not None
+        config, route = self.config, self._route(goal)
+        path = Trajectory.through(route.path)
+        found = check(self.body, path, self.field, config.chomp.validation)
+        margin = min(config.margin, found.clearance - 0.005)
+        validation = replace(config.chomp.validation, margin=margin)
+        chomp = Chomp(self.body, replace(config.chomp, validation=validation), self.seed)
+        guess = Trajectory.through(route.path, config.num_waypoints) if len(path) > 1 else path
+        result = chomp.optimise(guess, self.field)
+        if not result.success:
+            verdict = check(self.body, path, self.field, validation)
+            result = replace(
+                result,
+                trajectory=path,
+                status=verdict.status,
+                message=f"the searched route: {verdict.message}",
+                clearance=verdict.clearance,
+            )
+        return result, route.reaches_goal
+
+    def _still_good(self) -> bool:
+        """Whether what is left of the plan keeps its clearance on the new map."""
         if self.plan is None or self.field is None:
             return False
-        if float((self.plan.trajectory.waypoints[-1] - target).norm()) > 0.25:
-            return False
         left = self._remaining(self.plan.trajectory)
-        clearance = check(self.body, left, self.field, self.config.planner.chomp.validation).clearance
+        clearance = check(self.body, left, self.field, self.config.chomp.validation).clearance
         wanted = min(self.config.margin, self.plan.clearance) - self.config.clearance_change
-        return clearance >= max(wanted, self.config.least_margin)
-
-    def _planned(self, start: Float[Tensor, "2"], target: Float[Tensor, "2"]) -> PlanResult:
-        """Plan with as much clearance as start and target have themselves; the cost still seeks more."""
-        assert self.field is not None
-        config = self.config
-        margin = min(config.margin, float(self._clearance(torch.stack([start, target])).min()) - 0.005)
-        planner = Planner(
-            self.body, _with_margin(config.planner, max(margin, config.least_margin)), self.seed
-        )
-        warm = None if self.plan is None else self._remaining(self.plan.trajectory)
-        if warm is not None and len(warm) > 2:
-            warm = Trajectory.through(warm.waypoints, config.planner.num_waypoints, config.planner.duration)
-        return planner.plan(start, target, self.field, warm)
+        return clearance >= wanted
 
     def _remaining(self, trajectory: Trajectory) -> Trajectory:
         """The part of a path ahead of the base, starting where the base stands."""
@@ -377,12 +369,3 @@ class ReplanningLoop:
     def _end(self, status: DriveStatus, message: str) -> None:
         self.report.status, self.report.message = status, message
         logger.info("drive ended: %s (%s)", status.value, message)
-
-
-def _with_margin(planner: PlannerConfig, margin: float) -> PlannerConfig:
-    """The planner held to another clearance [m]."""
-    return replace(
-        planner,
-        chomp=replace(planner.chomp, validation=replace(planner.chomp.validation, margin=margin)),
-        rrt=replace(planner.rrt, margin=margin + 0.01, min_margin=margin),
-    )

@@ -1,0 +1,148 @@
+"""Arm motions of a parked mobile manipulator: grasp candidates, plans through the map, straight lines, execution."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import planning
+import robots
+from planning.protocols import DistanceField
+from planning.workspace import Workspace, WorkspaceConfig
+from robots.inverse_kinematics import solve
+from robots.simulation import SimulatedMobileRobot
+
+BASE = ("base_x", "base_y", "base_yaw")
+CONTROL_PERIOD = 0.02
+# The share of the URDF's speed limits the arm uses, and its accelerations [rad/s^2 | m/s^2].
+SPEED_SHARE, ACCELERATION = 0.4, 1.0
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """One way to take an object: postures (dof,) before it, at it and lifted, along straight lines."""
+
+    approach: Tensor
+    """(k, dof), from the pre-grasp posture to the grasp."""
+    lift: Tensor
+    """(k, dof), from the grasp upwards."""
+    clearance: float
+    """Of the pre-grasp posture in the map [m]."""
+
+
+def grasp_candidates(
+    model: robots.Robot,
+    q: Tensor,
+    target: np.ndarray,
+    yaw: float,
+    field: DistanceField,
+    retreat: float = 0.13,
+    rise: float = 0.14,
+    seed: int = 0,
+) -> list[Grasp]:
+    """Grasps of an upright object from the robot's side, those with the most room before them first.
+
+    Args:
+        model: the parked robot: only the arm's and the torso's joints.
+        q: its posture now (dof,).
+        target: where the middle of the fingers should close [m].
+        yaw: heading of the base; the hand comes from about there.
+        field: the map.
+        retreat: how far before the target the straight approach begins [m].
+        rise: how far the object is lifted [m].
+        seed: of the inverse kinematics.
+    """
+    found = []
+    for pitch, turn in itertools.product((0.3, 0.15, 0.5), (0.0, 0.3, -0.3)):
+        tool = tool_pose(target, yaw + turn, pitch)
+        before = tool.clone()
+        before[:3, 3] -= retreat * tool[:3, 2]
+        ends = solve(model, before, q, num_seeds=48, seed=seed)
+        if not bool(ends.converged[0]):
+            continue
+        approach = straight_line(model, ends.q[0], before, tool)
+        above = tool.clone()
+        above[2, 3] += rise
+        lift = None if approach is None else straight_line(model, approach[-1], tool, above)
+        if approach is not None and lift is not None:
+            found.append(Grasp(approach, lift, clearance(model, ends.q, field)))
+    return sorted(found, key=lambda g: -min(g.clearance, 0.06))
+
+
+def tool_pose(position: np.ndarray, yaw: float, pitch: float) -> Tensor:
+    """(4, 4) pose of a tool at a point, its z axis (the fingers) along yaw and down by pitch [rad], y level."""
+    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
+    left = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    T = np.eye(4)
+    T[:3, :3] = np.stack([np.cross(left, forward), left, forward], axis=1)
+    T[:3, 3] = position
+    return torch.as_tensor(T, dtype=torch.float32)
+
+
+def straight_line(
+    model: robots.Robot, q: Tensor, start: Tensor, end: Tensor, steps: int = 8
+) -> Tensor | None:
+    """Postures (steps + 1, dof) that move the tool along a line; None where it leaves the arm's reach or jumps."""
+    postures = [q]
+    for share in torch.linspace(0, 1, steps + 1)[1:]:
+        pose = start.clone()
+        pose[:3, 3] = torch.lerp(start[:3, 3], end[:3, 3], share)
+        step = solve(model, pose, postures[-1], num_seeds=1)
+        if not bool(step.converged[0]) or float((step.q[0] - postures[-1]).abs().max()) > 0.35:
+            return None
+        postures.append(step.q[0])
+    return torch.stack(postures)
+
+
+def clearance(model: robots.Robot, q: Tensor, field: DistanceField) -> float:
+    """Least clearance [m] of postures q (n, dof) in a field, the floor under the base left out."""
+    workspace = Workspace(model, field, eps=1.0, config=WorkspaceConfig(floor_tolerance=0.1))
+    return float(workspace.clearance(*model.spheres(q)).amin())
+
+
+def plan_reach(
+    model: robots.Robot, q: Tensor, goal: Tensor, field: DistanceField, margin: float, seed: int = 0
+) -> planning.PlanResult:
+    """Plan the arm from q to goal with a margin [m] as large as both of them have themselves, at most `margin`."""
+    margin = min(margin, clearance(model, torch.stack([q, goal]), field) - 0.005)
+    floor = WorkspaceConfig(floor_tolerance=0.1)
+    validation = planning.ValidationConfig(margin=margin, max_step=0.02, workspace=floor)
+    config = planning.PlannerConfig(
+        num_waypoints=40,
+        chomp=planning.ChompConfig(eps=0.12, max_iterations=150, validation=validation),
+        rrt=planning.RrtConfig(margin=margin + 0.005, min_margin=margin, seconds=5.0, workspace=floor),
+    )
+    return planning.Planner(model, config, seed).plan(q, goal, field)
+
+
+def execute(robot: SimulatedMobileRobot, model: robots.Robot, waypoints: Tensor, speed: float = 1.0) -> None:
+    """Move the arm along postures (n, dof) of `model`, the base at rest."""
+    limits = speed * SPEED_SHARE * model.velocity_limits
+    path = planning.Trajectory.through(waypoints)
+    timed = planning.retime(path, limits, speed * ACCELERATION * torch.ones(model.num_dofs))
+    columns = [robot.robot.joint_names.index(name) for name in model.joint_names]
+    command = robot.posture()
+    for t in np.arange(0.0, timed.duration + CONTROL_PERIOD, CONTROL_PERIOD):
+        here, ahead = timed.at(float(t)), timed.at(float(t) + CONTROL_PERIOD)
+        speed_now = np.zeros_like(command)
+        command[columns], speed_now[columns] = ahead, (ahead - here) / CONTROL_PERIOD
+        robot.world.command_joints(command, speed_now)
+        robot.drive(0.0, 0.0, CONTROL_PERIOD)
+    robot.wait(0.5)
+
+
+def parked(model: robots.Robot, posture: np.ndarray) -> tuple[robots.Robot, Tensor]:
+    """The robot with its base held where it is, and the posture of the joints that are left."""
+    values = dict(zip(model.joint_names, posture.tolist(), strict=True))
+    arm = model.with_fixed({name: values[name] for name in BASE})
+    return arm, torch.tensor([values[name] for name in arm.joint_names], dtype=torch.float32)
+
+
+def within_limits(model: robots.Robot, q: Tensor) -> Tensor:
+    """q moved inside the joint limits: motors settle a hair beyond them."""
+    low, high = model.joint_limits.to(q).unbind(-1)
+    return q.clamp(low + 1e-4, high - 1e-4)

@@ -1,0 +1,155 @@
+"""A first path for a base: Dijkstra over a grid of positions, so that none is missed and the roomiest is preferred."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor
+
+from planning.errors import ConfigError, TrajectoryError
+from planning.protocols import DistanceField, SphereRobot
+from planning.workspace import Workspace, WorkspaceConfig
+
+
+@dataclass(frozen=True)
+class GridSearchConfig:
+    """How positions are searched.
+
+    Args:
+        spacing: of the grid [m].
+        padding: the grid reaches this far beyond start and goal [m].
+        margin: clearance [m] from which on a position costs no more than its length.
+        least_margin: clearance [m] below which a position is blocked. May be negative for a map that is still some
+            centimetres wrong.
+        caution: how many times longer a way at the least margin counts than one at the margin.
+        escape: positions this near to the start [m] are never blocked: the robot stands there.
+        workspace: rules for the floor and for unknown space, which counts as blocked.
+    """
+
+    spacing: float = 0.1
+    padding: float = 3.0
+    margin: float = 0.15
+    least_margin: float = 0.0
+    caution: float = 10.0
+    escape: float = 0.25
+    workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
+
+    def __post_init__(self) -> None:
+        if min(self.spacing, self.padding) <= 0 or self.margin <= self.least_margin or self.caution < 1:
+            raise ConfigError(
+                "GridSearchConfig: spacing and padding must be positive, margin above least_margin and caution at "
+                f"least 1, got {self}."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """A path over the grid.
+
+    Args:
+        path: (k, 2) positions [m] from the start to the goal, or to the reachable place nearest to it.
+        reaches_goal: whether it ends at the goal.
+    """
+
+    path: Float[Tensor, "k 2"]
+    reaches_goal: bool
+
+
+def grid_search(
+    robot: SphereRobot,
+    sdf: DistanceField,
+    start: Float[Tensor, "2"],
+    goal: Float[Tensor, "2"],
+    config: GridSearchConfig | None = None,
+) -> Route:
+    """Search the cheapest path of a robot with q = (x, y).
+
+    Args:
+        robot: two joints, metres.
+        sdf: the field to keep clear of.
+        start: position [m].
+        goal: position [m].
+        config: see `GridSearchConfig`.
+
+    Raises:
+        TrajectoryError: if the robot has not two joints.
+    """
+    config = config or GridSearchConfig()
+    if robot.num_dofs != 2:
+        raise TrajectoryError(f"grid_search: the robot must have 2 joints (x, y), got {robot.num_dofs}.")
+    positions, shape = _grid(start, goal, config)
+    cost = _cost(robot, sdf, positions, start, config)
+    near_start, near_goal = (int((positions - p).norm(dim=1).argmin()) for p in (start, goal))
+    graph = _graph(cost.numpy().astype(float), shape, config.spacing)
+    reach, before = dijkstra(graph, indices=near_start, return_predecessors=True)
+    reaches = bool(np.isfinite(reach[near_goal]))
+    end = near_goal
+    if not reaches:
+        gap = (positions - goal).norm(dim=1).numpy()
+        end = int(np.where(np.isfinite(reach), gap, np.inf).argmin())
+    cells = [end]
+    while cells[-1] != near_start:
+        cells.append(int(before[cells[-1]]))
+    path = positions[cells[::-1]].clone()
+    ends = [start[None], path[1:-1], goal[None] if reaches else path[-1:]]
+    return Route(torch.cat(ends), reaches)
+
+
+def _grid(
+    start: Tensor, goal: Tensor, config: GridSearchConfig
+) -> tuple[Float[Tensor, "n 2"], tuple[int, int]]:
+    """Positions on a grid through the start, around start and goal."""
+    ends = torch.stack([start, goal])
+    low = ((ends.amin(dim=0) - config.padding - start) / config.spacing).floor()
+    high = ((ends.amax(dim=0) + config.padding - start) / config.spacing).ceil()
+    axes = [
+        start[i] + config.spacing * torch.arange(int(low[i]), int(high[i]) + 1, dtype=start.dtype)
+        for i in (0, 1)
+    ]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    return grid.reshape(-1, 2), (len(axes[0]), len(axes[1]))
+
+
+def _cost(
+    robot: SphereRobot, sdf: DistanceField, positions: Tensor, start: Tensor, config: GridSearchConfig
+) -> Float[Tensor, "n"]:
+    """What a metre of way counts at each position; inf where blocked."""
+    workspace = Workspace(robot, sdf, eps=1.0, config=config.workspace)
+    clearance = torch.empty(len(positions), dtype=positions.dtype)
+    unknown = torch.zeros(len(positions), dtype=torch.bool)
+    for block in torch.arange(len(positions)).split(500):
+        centres, radii = robot.spheres(positions[block])
+        clearance[block] = workspace.clearance(centres, radii).amin(dim=-1)
+        seen = workspace.unknown(centres)
+        if seen is not None:
+            unknown[block] = seen.any(dim=-1)
+    short = ((config.margin - clearance) / (config.margin - config.least_margin)).clamp(min=0.0)
+    blocked = _blocked(clearance, unknown, config) & ((positions - start).norm(dim=1) > config.escape)
+    cost = 1 + (config.caution - 1) * short
+    return cost.masked_fill(blocked, torch.inf)
+
+
+def _blocked(clearance: Tensor, unknown: Tensor, config: GridSearchConfig) -> Bool[Tensor, "n"]:
+    return ~(clearance >= config.least_margin) | unknown  # NaN is blocked
+
+
+def _graph(cost: Float[ndarray, "n"], shape: tuple[int, int], spacing: float) -> csr_array:
+    """The 8 neighbours of every free cell, with the length times the mean cost of both ends."""
+    index = np.arange(len(cost)).reshape(shape)
+    rows, columns, weights = [], [], []
+    for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        here = index[: shape[0] - di, max(0, -dj) : shape[1] - max(0, dj)].ravel()
+        there = index[di:, max(0, dj) : shape[1] + min(0, dj)].ravel()
+        weight = spacing * np.hypot(di, dj) * 0.5 * (cost[here] + cost[there])
+        free = np.isfinite(weight)
+        rows += [here[free], there[free]]
+        columns += [there[free], here[free]]
+        weights += [weight[free], weight[free]]
+    entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+    return csr_array(entries, shape=(len(cost), len(cost)))
