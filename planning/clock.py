@@ -29,6 +29,7 @@ class OnlineMap(Protocol):
         ...
 
 
+@runtime_checkable
 class Clock(Protocol):
     """Says how long the robot's computer took; the world moves on by that."""
 

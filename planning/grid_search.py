@@ -28,7 +28,8 @@ class GridSearchConfig:
         least_margin: clearance [m] below which a position is blocked. May be negative for a map that is still some
             centimetres wrong.
         caution: how many times longer a way at the least margin counts than one at the margin.
-        escape: positions this near to the start [m] are never blocked: the robot stands there.
+        escape: where the start is blocked, positions this near to it [m] are not, unless they are less clear: the
+            robot stands there and may leave, but not go in deeper.
         workspace: rules for the floor and for unknown space, which counts as blocked.
     """
 
@@ -78,11 +79,15 @@ def grid_search(
         config: see `GridSearchConfig`.
 
     Raises:
-        TrajectoryError: if the robot has not two joints.
+        TrajectoryError: if the robot has not two joints, or start or goal is not finite.
     """
     config = config or GridSearchConfig()
     if robot.num_dofs != 2:
         raise TrajectoryError(f"grid_search: the robot must have 2 joints (x, y), got {robot.num_dofs}.")
+    if not torch.isfinite(torch.stack([start, goal])).all():
+        raise TrajectoryError(
+            f"grid_search: start and goal must be finite, got {start.tolist()} and {goal.tolist()}."
+        )
     positions, shape = _grid(start, goal, config)
     cost = _cost(robot, sdf, positions, start, config)
     near_start, near_goal = (int((positions - p).norm(dim=1).argmin()) for p in (start, goal))
@@ -130,7 +135,10 @@ def _cost(
         if seen is not None:
             unknown[block] = seen.any(dim=-1)
     short = ((config.margin - clearance) / (config.margin - config.least_margin)).clamp(min=0.0)
-    blocked = _blocked(clearance, unknown, config) & ((positions - start).norm(dim=1) > config.escape)
+    away = (positions - start).norm(dim=1)
+    here = int(away.argmin())
+    escape = (away <= config.escape) & (clearance >= clearance[here]) & (unknown <= unknown[here])
+    blocked = _blocked(clearance, unknown, config) & ~escape
     cost = 1 + (config.caution - 1) * short
     return cost.masked_fill(blocked, torch.inf)
 

@@ -179,6 +179,7 @@ class ReplanningLoop:
         self._failures = 0
         self._retry_at = -math.inf
         self._to_goal = False
+        self._mapped = False
 
     def drive_to(self, goal: Float[ndarray, "2"], final_yaw: float | None = None) -> DriveReport:
         """Look around, then map, plan and drive until the goal is reached or given up.
@@ -188,26 +189,27 @@ class ReplanningLoop:
             final_yaw: heading to end with [rad]; any if None.
         """
         started, self.report, self.plan = self.robot.time, DriveReport(), None
+        self._failures, self._retry_at, self._to_goal = 0, -math.inf, False
         self._scan()
         self.tracker.reset()
         while self.robot.time - started < self.config.time_limit:
             spent = self._sense_and_map()
+            leads_to_goal = self.plan is not None and self._to_goal
             fresh, planning = self._plan_if_needed(goal)
             self._follow(spent + planning, final_yaw)
             self.plan = fresh
             self.report.rounds += 1
             if self.watch:
                 self.watch(self)
-            if self.plan is not None and self.tracker.finished and self._to_goal:
+            if leads_to_goal and self.tracker.finished:
                 self._end(DriveStatus.REACHED, "the base stands on the goal")
                 break
             if self._failures > self.config.patience:
                 self._end(DriveStatus.UNREACHABLE, self.report.message)
                 break
         else:
-            self._end(
-                DriveStatus.TIME_LIMIT, f"not there after {self.config.time_limit:g} s; {self.report.message}"
-            )
+            reason = f"; {self.report.message}" if self.report.message else ""
+            self._end(DriveStatus.TIME_LIMIT, f"not there after {self.config.time_limit:g} s{reason}")
         self.robot.drive(0.0, 0.0, self.config.tracker.period)
         self.report.duration = self.robot.time - started
         self.report.goal_distance = float(np.linalg.norm(self.robot.base_state()[:2] - goal))
@@ -215,14 +217,11 @@ class ReplanningLoop:
 
     def _scan(self) -> None:
         """Turn on the spot and map what comes into view."""
-        rate, turned = self.config.scan_rate, 0.0
-        while True:
+        rate, started = self.config.scan_rate, self.robot.time
+        while rate * (self.robot.time - started) < self.config.scan:
             spent = self._sense_and_map()
-            if turned >= self.config.scan:
-                return
             self._ahead(self.robot.base_state())
             self._pass_time(spent, lambda _: (0.0, rate))
-            turned += rate * spent
             if self.watch:
                 self.watch(self)
 
@@ -236,12 +235,13 @@ class ReplanningLoop:
             try:
                 self.mapper.integrate(frame)
                 self.report.frames += 1
+                self._mapped = True
             except ValueError as error:
                 logger.warning("frame passed over: %s", error)
                 self.report.frames_refused += 1
 
         _, spent = self.clock.charge(integrate)
-        if self.report.frames > 0:
+        if self._mapped:
             spent += self.clock.train(self.mapper)
         self.report.mapping_seconds += spent
         return spent
@@ -249,6 +249,9 @@ class ReplanningLoop:
     def _plan_if_needed(self, goal: Float[ndarray, "2"]) -> tuple[PlanResult | None, float]:
         """The plan to follow from now on (None: stand), and the time it took to find out."""
         if self.plan is None and self.robot.time < self._retry_at:
+            return None, 0.0
+        if self.report.frames == 0:
+            self.report.message = "the map has had no frame yet"
             return None, 0.0
         plans = self.report.plans
         plan, spent = self.clock.charge(lambda: self._decide(goal))
@@ -259,6 +262,11 @@ class ReplanningLoop:
 
     def _decide(self, goal: Float[ndarray, "2"]) -> PlanResult | None:
         """Keep the plan while it is good; else make one, to the goal or as near to it as the map allows."""
+        if not self._mapped:
+            self.report.message = "no usable frame has come in yet"
+            self._failures += 1
+            self._retry_at = self.robot.time + self.config.retry
+            return None
         self.field = self.snapshot()
         if self._still_good():
             if self._to_goal:
@@ -267,9 +275,11 @@ class ReplanningLoop:
                 return self.plan
         fresh, to_goal = self._planned(goal)
         self.report.plans += 1
-        dead_end = fresh.success and not to_goal and fresh.trajectory.joint_path_length < 0.2
+        gaps = (fresh.trajectory.waypoints - torch.as_tensor(goal, dtype=torch.float32)).norm(dim=1)
+        # Without a least gain the robot could circle a walled-in goal for ever.
+        dead_end = fresh.success and not to_goal and float(gaps[0] - gaps[-1]) < self.config.search.spacing
         if fresh.success and not dead_end:
-            self._failures, self._to_goal = 0, to_goal
+            self._failures, self._to_goal, self.report.message = 0, to_goal, ""
             return fresh
         self._failures += 1
         self._retry_at = self.robot.time + self.config.retry
