@@ -2,14 +2,13 @@
 
     python -m examples.grasp --out runs/grasp --scene apartment --seed 0
 
-The object's place is given, as a detector would; the room is not. Leaves report.json, states.npz (every executed
-step), map.png, map.safetensors and episode.gif. Success is read from the physics: lifted 10 cm and held for 2 s.
+The object's place is given, as a detector would; the room is not. Leaves report.html, report.json, states.npz (every
+executed step), map.png, map.safetensors and episode.gif. Success is read from the physics: lifted 10 cm, held for 2 s.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from tqdm import tqdm
 from examples.arm import Grasp, execute, grasp_candidates, parked, plan_reach, within_limits
 from examples.episode import Episode, EpisodeOptions
 from examples.pictures import Film, save_map_picture
+from examples.report import write_report
 from planning.replanning import DriveReport, ReplanningConfig, ReplanningLoop
 from robots.simulation import GraspTask
 
@@ -162,10 +162,13 @@ def start_before(episode: Episode, task: GraspTask, distance: float, seed: int) 
     """A free base pose about `distance` [m] from the parking place, turned any way."""
     rng = np.random.default_rng([seed, 77])
     field = episode.world.field()
+    width, length, _ = episode.scene.size or (math.inf, math.inf, 0.0)
     best, most = task.park, -math.inf
     for _ in range(400):
         angle, reach = rng.uniform(-math.pi, math.pi), rng.uniform(0.8, 1.2) * distance
         x, y = task.park[0] + reach * math.cos(angle), task.park[1] + reach * math.sin(angle)
+        if max(abs(x) / width, abs(y) / length) > 0.5:
+            continue  # outside of the room it is free, too
         column = torch.tensor([[x, y, z] for z in np.arange(0.55, 1.3, 0.15)], dtype=torch.float32)
         room = float(field.distance(column).min())
         if room > 0.55:
@@ -208,10 +211,22 @@ def main(options: GraspOptions) -> dict:
     save_map_picture(options.out / "map.png", episode, driven, np.array(grasping.task.park))
     if options.film:
         grasping.film.save(options.out / "episode.gif")
-    (options.out / "report.json").write_text(json.dumps(report, indent=1) + "\n")
+    write_report(options.out, report, headline(report))
     episode.close()
     return report
 
 
+def headline(report: dict) -> str:
+    """What happened, in a line."""
+    if report["success"]:
+        verdict = f"Lifted the object {100 * report['lift_height']:.0f} cm and held it {report['held_seconds']:.0f} s"
+    else:
+        verdict = f"Failed at: {report['ended']}"
+    return f"{verdict}, {report['contacts']} contacts with anything else, {report['robot_seconds']:.0f} s in all."
+
+
 if __name__ == "__main__":
-    print(json.dumps(main(tyro.cli(GraspOptions)), indent=1))
+    options = tyro.cli(GraspOptions)
+    outcome = main(options)
+    print(headline(outcome))
+    print(f"report: {options.out / 'report.html'}")

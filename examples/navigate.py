@@ -2,14 +2,13 @@
 
     python -m examples.navigate --out runs/navigate --scene apartment --seed 0
 
-Leaves report.json, states.npz (every executed step), map.png, mesh.ply, map.safetensors and episode.gif. Success and
-contacts are read from the physics.
+Leaves report.html, report.json, states.npz (every executed step), map.png, mesh.ply, map.safetensors and episode.gif.
+Success and contacts are read from the physics.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from dataclasses import dataclass
 
@@ -20,6 +19,7 @@ from tqdm import tqdm
 
 from examples.episode import Episode, EpisodeOptions
 from examples.pictures import Film, save_map_picture
+from examples.report import write_report
 from isdf.meshing import zero_level_mesh
 from planning.replanning import DriveReport, ReplanningConfig, ReplanningLoop
 
@@ -116,7 +116,17 @@ def _write(options: Navigate, episode: Episode, film: Film, goal: np.ndarray, re
     save_map_picture(out / "map.png", episode, np.array(film.path).reshape(-1, 2), goal)
     if options.film:
         film.save(out / "episode.gif")
-    (out / "report.json").write_text(json.dumps(report, indent=1) + "\n")
+    write_report(out, report, headline(report))
+
+
+def headline(report: dict) -> str:
+    """What happened, in a line."""
+    drive = report["drive"]
+    verdict = "Reached the goal" if report["success"] else f"Did not reach the goal ({drive['message']})"
+    return (
+        f"{verdict}: {drive['path_length']:.1f} m driven in {drive['duration']:.0f} s, {report['contacts']} contacts, "
+        f"{drive['plans']} plans, {report['map']['steps']} training steps."
+    )
 
 
 def _no_goal(options: Navigate) -> tuple[float, float]:
@@ -124,5 +134,7 @@ def _no_goal(options: Navigate) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    outcome = main(tyro.cli(Navigate))
-    print(json.dumps({k: outcome[k] for k in ("success", "contacts", "drive", "map")}, indent=1))
+    options = tyro.cli(Navigate)
+    outcome = main(options)
+    print(headline(outcome))
+    print(f"report: {options.out / 'report.html'}")

@@ -36,7 +36,7 @@ class Film:
         """Take a frame now if the last one is old enough; `plan` is (n, 2) positions [m]."""
         robot = self.episode.robot
         self.path.append(robot.base_state()[:2])
-        if robot.time - self._last < self.least_gap:
+        if robot.time - self._last < self.least_gap or self.episode.mapper.frames_seen == 0:
             return
         self._last = robot.time
         figure = Figure(figsize=(9.6, 3.9), layout="constrained")
