@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from robots.errors import UnknownLinkError, UrdfError
 from robots.kinematic_tree import read_urdf
 from robots.mesh_paths import resolve_mesh, write_atomically, write_cached
@@ -113,7 +115,23 @@ def _parts(robot: ElementTree.Element, path: str | Path, prefix: str) -> list[El
             mesh.set("filename", str(resolve_mesh(mesh.get("filename", ""), path)))
         if part.tag == "link" and part.find("inertial") is None:
             part.append(_inertial(mass=1e-3, moment=1e-6))
+        for inertia in part.iter("inertia"):
+            _make_possible(inertia)
     return parts
+
+
+def _make_possible(inertia: ElementTree.Element) -> None:
+    """Replace an inertia that no body can have by that of a ball with the same trace.
+
+    Published URDFs hold some; simulators set them to zero and warn. The principal moments of a body are positive and
+    none exceeds the sum of the others.
+    """
+    xx, xy, xz, yy, yz, zz = (float(inertia.get(k, "0")) for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+    low, middle, high = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if low > 0 and high <= (low + middle) * (1 + 1e-6):
+        return
+    moment = repr(max((xx + yy + zz) / 3, 1e-9))
+    inertia.attrib.update(ixx=moment, iyy=moment, izz=moment, ixy="0", ixz="0", iyz="0")
 
 
 def _mount(robot: ElementTree.Element, attachment: Attachment) -> None:

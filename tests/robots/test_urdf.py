@@ -43,6 +43,19 @@ def test_compose_keeps_inertia_and_drops_extensions(arm: Path) -> None:
     assert root.find("transmission") is None
 
 
+def test_an_inertia_no_body_can_have_is_replaced(tmp_path: Path) -> None:
+    for bad in (
+        'ixx="1" ixy="2" ixz="0" iyy="1" iyz="0" izz="1"',
+        'ixx="9" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"',
+    ):
+        path = tmp_path / "bad.urdf"
+        path.write_text(ARM.replace('ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"', bad))
+        inertia = ElementTree.fromstring(robots.compose(path).read_text()).find("link/inertial/inertia")
+        moments = [float(inertia.get(k)) for k in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")]
+        trace = sum(float(word.split('"')[1]) for word in bad.split() if word[:3] in ("ixx", "iyy", "izz"))
+        assert moments == pytest.approx([trace / 3] * 3 + [0.0] * 3)
+
+
 def test_planar_base_comes_first_and_moves_everything(arm: Path) -> None:
     tree = KinematicTree.from_urdf(robots.compose(arm, planar_base=robots.PlanarBase(velocity=0.7)))
     assert tree.movable_joints == ("base_x", "base_y", "base_yaw", "wrist")
