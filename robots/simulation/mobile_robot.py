@@ -47,11 +47,11 @@ class SimulatedMobileRobot:
         max_range: float = 5.0,
         filter_margin: float = 0.03,
     ) -> None:
-        if not set(BASE_JOINTS) <= set(robot.joint_names) or len(robot.head_joints) != 2:
-            raise RobotError(
-                f"{robot.name!r} cannot drive and look: it needs the joints {BASE_JOINTS} and two head joints, it has "
-                f"{robot.joint_names} and {robot.head_joints}"
-            )
+        lacks = [f"the joint {name}" for name in BASE_JOINTS if name not in robot.joint_names]
+        lacks += [] if len(robot.head_joints) == 2 else ["two head joints"]
+        lacks += [] if robot.camera_link else ["a camera link"]
+        if lacks:
+            raise RobotError(f"{robot.name!r} cannot drive and look: it lacks {', '.join(lacks)}")
         self.world, self.robot, self.noise = world, robot, noise
         self.filter_margin = filter_margin
         self.simulated = world.add_robot(
