@@ -67,6 +67,7 @@ class GraspEpisode:
         if not self.approach():
             return "approach"
         self.bar.set_description("mapping the table")
+        self.film.close_up = self.episode.world.object_pose(self.task.object_name)[:3, 3]
         self.map_table()
         self.bar.set_description("planning the reach")
         grasp, reach = self.plan()
@@ -207,8 +208,7 @@ def main(options: GraspOptions) -> dict:
     options.out.mkdir(parents=True, exist_ok=True)
     episode.robot.recording.save(options.out / "states.npz")
     episode.mapper.save(options.out / "map.safetensors")
-    driven = np.array(grasping.film.path).reshape(-1, 2)
-    save_map_picture(options.out / "map.png", episode, driven, np.array(grasping.task.park))
+    save_map_picture(options.out / "map.png", episode, np.array(grasping.task.park))
     if options.film:
         grasping.film.save(options.out / "episode.gif")
     write_report(options.out, report, headline(report))

@@ -74,7 +74,7 @@ def _report(
     options: Navigate, episode: Episode, goal: np.ndarray, drive: DriveReport, wall_seconds: float
 ) -> dict:
     contacts = episode.contacts()
-    start = episode.robot.recording.first_base_pose()
+    start = episode.robot.recording.base_poses()[0]
     return {
         "example": "navigate",
         "scene": options.scene,
@@ -113,7 +113,7 @@ def _write(options: Navigate, episode: Episode, film: Film, goal: np.ndarray, re
     episode.robot.recording.save(out / "states.npz")
     episode.mapper.save(out / "map.safetensors")
     zero_level_mesh(episode.mapper.field(), 0.05).export(out / "mesh.ply")
-    save_map_picture(out / "map.png", episode, np.array(film.path).reshape(-1, 2), goal)
+    save_map_picture(out / "map.png", episode, goal)
     if options.film:
         film.save(out / "episode.gif")
     write_report(out, report, headline(report))

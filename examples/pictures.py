@@ -28,22 +28,22 @@ class Film:
 
     def __init__(self, episode: Episode, goal: np.ndarray, least_gap: float = 1.0) -> None:
         self.episode, self.goal, self.least_gap = episode, goal, least_gap
-        self.path: list[np.ndarray] = []
+        self.close_up: np.ndarray | None = None
+        """A point [m] to look at from near instead of the whole room."""
         self._frames: list[Image.Image] = []
         self._last = -np.inf
 
     def add(self, plan: np.ndarray | None = None) -> None:
         """Take a frame now if the last one is old enough; `plan` is (n, 2) positions [m]."""
         robot = self.episode.robot
-        self.path.append(robot.base_state()[:2])
         if robot.time - self._last < self.least_gap or self.episode.mapper.frames_seen == 0:
             return
         self._last = robot.time
         figure = Figure(figsize=(9.6, 3.9), layout="constrained")
         left, right = figure.subplots(1, 2)
-        draw_map(left, self.episode, np.array(self.path), plan, self.goal, spacing=0.08)
+        draw_map(left, self.episode, plan, self.goal, spacing=0.08)
         left.set_title(f"map at {SLICE_HEIGHT} m, t = {robot.time:.0f} s")
-        right.imshow(overview(self.episode))
+        right.imshow(photo(self.episode, close_up=self.close_up))
         right.set_axis_off()
         self._frames.append(_rendered(figure))
 
@@ -55,24 +55,24 @@ class Film:
             small[0].save(path, save_all=True, append_images=small[1:], duration=180, loop=0, optimize=True)
 
 
-def save_map_picture(path: Path, episode: Episode, driven: np.ndarray, goal: np.ndarray) -> None:
+def save_map_picture(path: Path, episode: Episode, goal: np.ndarray) -> None:
     """The learned slice beside the true one, each with the driven path; and the room from above."""
     figure = Figure(figsize=(15, 4), layout="constrained")
-    learned, true, photo = figure.subplots(1, 3)
-    image = draw_map(learned, episode, driven, None, goal)
+    learned, true, room = figure.subplots(1, 3)
+    image = draw_map(learned, episode, None, goal)
     learned.set_title(f"learned signed distance at {SLICE_HEIGHT} m")
     if episode.world.solids:
-        draw_map(true, episode, driven, None, goal, truth=True)
+        draw_map(true, episode, None, goal, truth=True)
         true.set_title("ground truth")
     else:
         true.set_axis_off()
     figure.colorbar(image, ax=[learned, true], label="[m]", shrink=0.8)
-    photo.imshow(overview(episode, 960, 720))
-    photo.set_axis_off()
+    room.imshow(photo(episode, 960, 720))
+    room.set_axis_off()
     figure.savefig(path, dpi=110)
 
 
-def draw_map(axes, episode: Episode, driven, plan, goal, spacing: float = 0.03, truth: bool = False):
+def draw_map(axes, episode: Episode, plan, goal, spacing: float = 0.03, truth: bool = False):
     """One slice of the map with the robot, its way so far (red), its plan (green) and the goal (star)."""
     (x0, y0, _), (x1, y1, _) = episode.mapper.bounds.numpy()
     xs, ys = np.arange(x0, x1, spacing), np.arange(y0, y1, spacing)
@@ -90,8 +90,8 @@ def draw_map(axes, episode: Episode, driven, plan, goal, spacing: float = 0.03, 
     axes.contour(xs, ys, distance, levels=[0.0], colors="black", linewidths=1.0)
     for x, y, radius in base_outline(episode.model, episode.robot.posture()):
         axes.add_patch(_disc(x, y, radius))
-    if len(driven):
-        axes.plot(driven[:, 0], driven[:, 1], color="red", linewidth=1.5)
+    driven = episode.robot.recording.base_poses()
+    axes.plot(driven[:, 0], driven[:, 1], color="red", linewidth=1.5)
     if plan is not None:
         axes.plot(plan[:, 0], plan[:, 1], color="limegreen", linewidth=1.5)
     axes.plot(*goal[:2], "*", color="gold", markersize=14, markeredgecolor="black")
@@ -99,12 +99,21 @@ def draw_map(axes, episode: Episode, driven, plan, goal, spacing: float = 0.03, 
     return image
 
 
-def overview(episode: Episode, width: int = 480, height: int = 360) -> np.ndarray:
-    """The room and the robot from obliquely above, (height, width, 3) uint8."""
-    low, high = episode.mapper.bounds.numpy()
-    centre, span = (low + high) / 2, float((high - low)[:2].max())
-    eye = centre + np.array([0.0, -0.45 * span, 1.05 * span])
-    view = pybullet.computeViewMatrix(eye.tolist(), [centre[0], centre[1], 0.3], [0, 0, 1])
+def photo(
+    episode: Episode, width: int = 480, height: int = 360, close_up: np.ndarray | None = None
+) -> np.ndarray:
+    """The room from obliquely above, or a point of it from near: (height, width, 3) uint8."""
+    if close_up is None:
+        low, high = episode.mapper.bounds.numpy()
+        target, span = np.array([*(low + high)[:2] / 2, 0.3]), float((high - low)[:2].max())
+        eye = target + np.array([0.0, -0.45 * span, 1.05 * span])
+    else:
+        # From beside the robot, whose back would hide what it does.
+        yaw = float(episode.robot.base_state()[2])
+        forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
+        target = close_up
+        eye = target - 0.5 * forward + 1.3 * left + np.array([0.0, 0.0, 0.7])
+    view = pybullet.computeViewMatrix(eye.tolist(), target.tolist(), [0, 0, 1])
     projection = pybullet.computeProjectionMatrixFOV(50, width / height, 0.1, 60)
     shown = pybullet.getCameraImage(
         width,

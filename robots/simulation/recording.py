@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from robots.simulation.contacts import Contact
 from robots.simulation.world import World
@@ -36,9 +37,9 @@ class Recording:
         self._poses.append(np.array([self.world.object_pose(n) for n in self._movable]).reshape(-1, 4, 4))
         self.contacts += [(self.world.time, contact) for contact in self.world.contacts()]
 
-    def first_base_pose(self) -> np.ndarray:
-        """The first three joint positions recorded: where a mobile base started [m, m, rad]."""
-        return self._postures[0][:3]
+    def base_poses(self) -> Float[np.ndarray, "n 3"]:
+        """Where a mobile base was, (x, y, yaw) [m, m, rad]: the first three joints of every posture."""
+        return np.array([posture[:3] for posture in self._postures]).reshape(-1, 3)
 
     def touched(self, ignore: tuple[str, ...] = ()) -> dict[str, float]:
         """Deepest penetration [m] of each pair "link - body" that touched, but for the named bodies."""
