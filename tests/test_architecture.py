@@ -1,0 +1,158 @@
+"""The packages do not know each other, import lightly, have no import cycles and do not print."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import subprocess
+import sys
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("isdf", "planning", "robots")
+OUTSIDE = ("examples", "benchmarks", "tests")
+
+
+def sources(root: Path, package: str) -> dict[str, Path]:
+    """Files of a package by module name."""
+    found = {}
+    for path in sorted((root / package).rglob("*.py")):
+        parts = path.relative_to(root).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imported(nodes, module: str, is_package: bool, known: set[str]) -> set[str]:
+    """Modules that import statements among `nodes` name; of a `known` package, the submodule if it is one."""
+    names = set()
+    base = module if is_package else module.rpartition(".")[0]
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            source = node.module or ""
+            if node.level:
+                source = importlib.util.resolve_name("." * node.level + source, base)
+            for alias in node.names:
+                inner = f"{source}.{alias.name}"
+                names.add(inner if inner in known else source)
+    return names
+
+
+def everywhere(tree: ast.Module) -> list[ast.AST]:
+    """All statements, those inside functions included."""
+    return list(ast.walk(tree))
+
+
+def when_loaded(tree: ast.AST) -> list[ast.AST]:
+    """Statements that run on import: not those in functions, nor those for type checkers only."""
+    found: list[ast.AST] = []
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        found += [node, *when_loaded(node)]
+    return found
+
+
+def import_graph(root: Path, package: str, statements) -> dict[str, set[str]]:
+    files = sources(root, package)
+    return {
+        name: imported(statements(ast.parse(path.read_text())), name, path.name == "__init__.py", set(files))
+        for name, path in files.items()
+    }
+
+
+def cycle(graph: dict[str, set[str]]) -> list[str] | None:
+    """Modules of one import cycle, if there is any."""
+    inner = {name: {target for target in targets if target in graph} for name, targets in graph.items()}
+    try:
+        list(TopologicalSorter(inner).static_order())
+    except CycleError as error:
+        return list(error.args[1])
+    return None
+
+
+def prints(path: Path) -> list[int]:
+    calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+    return [call.lineno for call in calls if isinstance(call.func, ast.Name) and call.func.id == "print"]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_never_import_one_another(package: str) -> None:
+    graph = import_graph(ROOT, package, everywhere)
+    assert graph, f"no sources of {package} in {ROOT}"
+    others = {*PACKAGES, *OUTSIDE} - {package}
+    for module, targets in graph.items():
+        foreign = sorted(target for target in targets if target.partition(".")[0] in others)
+        assert not foreign, f"{module} imports {foreign}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_import_cycles(package: str) -> None:
+    found = cycle(import_graph(ROOT, package, when_loaded))
+    assert found is None, " -> ".join(found or [])
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_libraries_do_not_print(package: str) -> None:
+    talking = {
+        name: lines
+        for name, path in sources(ROOT, package).items()
+        if path.name != "cli.py" and (lines := prints(path))
+    }
+    assert not talking, f"print in {talking}; use logging"
+
+
+WINDOWS = {"tkinter", "pyglet", "viser", "cv2", "open3d", "matplotlib.pyplot", "OpenGL", "PyQt5", "PySide6"}
+
+
+@pytest.mark.parametrize(
+    ("package", "unwanted"),
+    [
+        ("isdf", {"pybullet", "casadi", "numba", "pytorch_kinematics", "planning", "robots"} | WINDOWS),
+        ("planning", {"pybullet", "casadi", "numba", "pytorch_kinematics", "isdf", "robots"} | WINDOWS),
+        # pytorch_kinematics loads pyplot, which opens no window by that.
+        (
+            "robots",
+            {"pybullet", "casadi", "robots.simulation", "isdf", "planning"} | WINDOWS - {"matplotlib.pyplot"},
+        ),
+    ],
+)
+def test_importing_a_package_loads_nothing_optional(package: str, unwanted: set[str]) -> None:
+    code = f"import sys, {package}; print(*sys.modules, sep='\\n')"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = set(run.stdout.split("\n"))
+    assert package in loaded and "torch" in loaded
+    assert not (found := loaded & unwanted), f"import {package} loads {sorted(found)}"
+
+
+def test_the_checks_see_what_they_look_for(tmp_path) -> None:
+    files = {
+        "isdf/__init__.py": "from .a import f\n",
+        "isdf/a.py": "from . import b\ndef f():\n    import planning.chomp\n",
+        "isdf/b.py": (
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from .c import C\ntry:\n    import json\n"
+            "except ImportError:\n    print('no')\n"
+        ),
+        "isdf/c.py": "class C:\n    from isdf.sub.d import e\n",
+        "isdf/sub/__init__.py": "",
+        "isdf/sub/d.py": "from .. import a as e\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    loaded = import_graph(tmp_path, "isdf", when_loaded)
+    assert loaded["isdf"] == {"isdf.a"} and loaded["isdf.a"] == {"isdf.b"}
+    assert loaded["isdf.b"] == {"typing", "json"}
+    assert loaded["isdf.c"] == {"isdf.sub.d"} and loaded["isdf.sub.d"] == {"isdf.a"}
+    assert cycle(loaded) is None
+    assert "planning.chomp" in import_graph(tmp_path, "isdf", everywhere)["isdf.a"]
+    assert prints(tmp_path / "isdf/b.py") == [7]
+    (tmp_path / "isdf/b.py").write_text("from isdf.c import C\n")
+    found = cycle(import_graph(tmp_path, "isdf", when_loaded))
+    assert found and {"isdf.a", "isdf.b", "isdf.c", "isdf.sub.d"} == set(found)
