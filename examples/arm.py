@@ -12,7 +12,7 @@ from torch import Tensor
 import planning
 import robots
 from planning.protocols import DistanceField
-from planning.workspace import Workspace, WorkspaceConfig
+from planning.workspace import Workspace
 from robots.inverse_kinematics import solve
 from robots.simulation import SimulatedMobileRobot
 
@@ -100,7 +100,7 @@ def straight_line(
 
 def clearance(model: robots.Robot, q: Tensor, field: DistanceField) -> float:
     """Least clearance [m] of postures q (n, dof) in a field, the floor under the base left out."""
-    workspace = Workspace(model, field, eps=1.0, config=WorkspaceConfig(floor_tolerance=0.1))
+    workspace = Workspace(model, field, eps=1.0)
     return float(workspace.clearance(*model.spheres(q)).amin())
 
 
@@ -109,12 +109,11 @@ def plan_reach(
 ) -> planning.PlanResult:
     """Plan the arm from q to goal with a margin [m] as large as both of them have themselves, at most `margin`."""
     margin = min(margin, clearance(model, torch.stack([q, goal]), field) - 0.005)
-    floor = WorkspaceConfig(floor_tolerance=0.1)
-    validation = planning.ValidationConfig(margin=margin, max_step=0.02, workspace=floor)
+    validation = planning.ValidationConfig(margin=margin, max_step=0.02)
     config = planning.PlannerConfig(
         num_waypoints=40,
         chomp=planning.ChompConfig(eps=0.12, max_iterations=150, validation=validation),
-        rrt=planning.RrtConfig(margin=margin + 0.005, min_margin=margin, seconds=5.0, workspace=floor),
+        rrt=planning.RrtConfig(margin=margin + 0.005, min_margin=margin, seconds=5.0),
     )
     return planning.Planner(model, config, seed).plan(q, goal, field)
 

@@ -74,7 +74,7 @@ def save_map_picture(path: Path, episode: Episode, goal: np.ndarray) -> None:
 
 def draw_map(axes, episode: Episode, plan, goal, spacing: float = 0.03, truth: bool = False):
     """One slice of the map with the robot, its way so far (red), its plan (green) and the goal (star)."""
-    (x0, y0, _), (x1, y1, _) = episode.mapper.bounds.numpy()
+    (x0, y0), (x1, y1) = region(episode)
     xs, ys = np.arange(x0, x1, spacing), np.arange(y0, y1, spacing)
     points = np.stack([*np.meshgrid(xs, ys), np.full((len(ys), len(xs)), SLICE_HEIGHT)], axis=-1)
     field = episode.world.field() if truth else episode.mapper.field()
@@ -99,13 +99,21 @@ def draw_map(axes, episode: Episode, plan, goal, spacing: float = 0.03, truth: b
     return image
 
 
+def region(episode: Episode) -> np.ndarray:
+    """Lower and upper corner (2, 2) [m] of the room, or of what has been seen of it."""
+    if episode.scene.size is None:
+        return episode.mapper.bounds[:, :2].numpy()
+    half = np.array(episode.scene.size[:2]) / 2 + 0.1
+    return np.stack([-half, half])
+
+
 def photo(
     episode: Episode, width: int = 480, height: int = 360, close_up: np.ndarray | None = None
 ) -> np.ndarray:
     """The room from obliquely above, or a point of it from near: (height, width, 3) uint8."""
     if close_up is None:
-        low, high = episode.mapper.bounds.numpy()
-        target, span = np.array([*(low + high)[:2] / 2, 0.3]), float((high - low)[:2].max())
+        low, high = region(episode)
+        target, span = np.array([*(low + high) / 2, 0.3]), float((high - low).max())
         eye = target + np.array([0.0, -0.45 * span, 1.05 * span])
     else:
         # From beside the robot, whose back would hide what it does.

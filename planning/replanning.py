@@ -25,12 +25,9 @@ from planning.protocols import DistanceField, SphereRobot
 from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
 from planning.trajectory import Trajectory
-from planning.validation import ValidationConfig, check
-from planning.workspace import WorkspaceConfig
+from planning.validation import check
 
 logger = logging.getLogger(__name__)
-
-LEARNED_FLOOR = WorkspaceConfig(floor_tolerance=0.10)
 
 
 @runtime_checkable
@@ -78,16 +75,10 @@ class ReplanningConfig:
         time_limit: [s] of the robot's time.
     """
 
-    # A map still being learned is some centimetres wrong, also about the floor, and the robot stands where it stands:
-    # hence the generous floor tolerance and the negative least margin.
-    search: GridSearchConfig = field(
-        default_factory=lambda: GridSearchConfig(least_margin=-0.10, workspace=LEARNED_FLOOR)
-    )
-    chomp: ChompConfig = field(
-        default_factory=lambda: ChompConfig(
-            eps=0.35, max_iterations=120, validation=ValidationConfig(workspace=LEARNED_FLOOR)
-        )
-    )
+    # A map still being learned is some centimetres wrong, and the robot stands where it stands: hence the negative
+    # least margin.
+    search: GridSearchConfig = field(default_factory=lambda: GridSearchConfig(least_margin=-0.10))
+    chomp: ChompConfig = field(default_factory=lambda: ChompConfig(eps=0.35, max_iterations=120))
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     num_waypoints: int = 40
     margin: float = 0.05

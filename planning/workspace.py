@@ -27,7 +27,7 @@ class WorkspaceConfig:
         chunk: most points in one query of the field, to bound memory.
     """
 
-    floor_tolerance: float = 0.06
+    floor_tolerance: float = 0.10
     unknown_confidence: float | None = None
     chunk: int = 100_000
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from planning import FieldError
-from planning.workspace import Workspace
+from planning.workspace import Workspace, WorkspaceConfig
 from tests.planning.fields import Box, Cylinder, HalfSpace, HingeCost, NanBeyond, Room, Sphere, Union
 from tests.planning.robots import Base, Disc
 
@@ -39,8 +39,8 @@ def test_a_wall_nearer_than_the_floor_counts_for_floor_spheres(depth):
 
 
 def test_a_mapped_floor_may_be_wrong_by_the_tolerance():
-    robot = Base()
-    for error, exempt in ((0.05, True), (-0.05, True), (0.1, False)):
+    robot, tolerance = Base(), WorkspaceConfig().floor_tolerance
+    for error, exempt in ((0.9 * tolerance, True), (-0.9 * tolerance, True), (1.5 * tolerance, False)):
         clearance = _clearance(robot, HalfSpace(offset=error), [0.0, 0.0, 0.0])
         assert bool(clearance[:3].isinf().all()) is exempt
 
