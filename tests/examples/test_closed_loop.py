@@ -145,7 +145,7 @@ def test_the_grasp_report_agrees_with_the_states(lift) -> None:
     assert height[held].min() - height[0] >= grasp.LIFTED - 0.01
     np.testing.assert_allclose(saved["base_pose"][-1, :2], task.park[:2], atol=0.06)
     others = [i for i, name in enumerate(saved["object_names"]) if name != task.object_name]
-    places = saved["object_poses"][10:, others, :3, 3]  # after they have settled
+    places = saved["object_poses"][10:, :, :3, 3][:, others]  # after they have settled
     assert np.linalg.norm(places - places[0], axis=-1).max(initial=0.0) < 0.02, "nothing else was moved"
 
 
