@@ -135,15 +135,16 @@ class Mapper:
 
     @property
     def network(self) -> SDFNetwork:
-        """The live network, which training changes."""
+        """The live network, which training changes; NotReadyError before the first frame."""
         if self._network is None:
             raise NotReadyError("the map is empty: call mapper.integrate(frame) first")
         return self._network
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"]:
-        """Lower and upper corner [m] of the surfaces and cameras seen so far."""
-        self.network  # noqa: B018  (says so when the map is empty)
+        """Lower and upper corner [m] of the surfaces and cameras seen so far; NotReadyError before the first."""
+        if self._network is None:
+            raise NotReadyError("nothing was seen yet: call mapper.integrate(frame) first")
         return self._bounds.clone()
 
     def integrate(self, frame: Any) -> None:
@@ -185,7 +186,7 @@ class Mapper:
         distance, gradient = self.network.distance_and_gradient(batch.points.reshape(-1, 3))
         distance, gradient = distance.view(bound.shape), gradient.view(target.shape)
         if self.config.losses.noise > 0:
-            distance = distance + self._training_noise(batch, len(frames) - len(replayed) - 1)
+            distance = distance + self._training_noise(batch)
         loss = total_loss(distance, gradient, bound, target, batch.behind, self.config.losses)
         assert self._optimiser is not None
         self._optimiser.zero_grad(set_to_none=True)
@@ -254,17 +255,18 @@ class Mapper:
 
     def _select(self) -> tuple[list[DepthFrame], list[int]]:
         """The window of this step: replayed keyframes' indices, and all frames with the newest first."""
-        self.network  # noqa: B018
+        if self._newest is None:
+            raise NotReadyError("there is nothing to train on: call mapper.integrate(frame) first")
         replayed = self.keyframes.draw(self.config.keyframes.replayed, self.generator)
         last = self.keyframes.frames[-1]
         frames = [last] if self._newest is last else [self._newest, last]
         frames += [self.keyframes.frames[i] for i in replayed]
-        return [f for f in frames if f is not None], replayed
+        return frames, replayed
 
-    def _training_noise(self, batch: RayBatch, newest: int) -> Tensor:
-        """Noise on the predicted distance [m], twice as strong on keyframes as on the newest frame."""
+    def _training_noise(self, batch: RayBatch) -> Tensor:
+        """Noise on the predicted distance [m], twice as strong on keyframes as on the newest frame, the first."""
         scale = self.config.losses.noise * self.config.network.output_scale
-        by_ray = torch.where(batch.frame < max(newest, 1), scale, 2 * scale)
+        by_ray = torch.where(batch.frame == 0, scale, 2 * scale)
         noise = torch.randn(batch.along.shape, generator=self.generator).to(batch.along)
         return noise * by_ray[:, None]
 

@@ -145,7 +145,7 @@ def test_replay_prefers_keyframes_with_high_loss_and_never_repeats() -> None:
     generator = torch.Generator().manual_seed(0)
     drawn = [keyframes.draw(3, generator) for _ in range(200)]
     assert all(len(set(d)) == 3 and 5 not in d for d in drawn)  # the last one is in every window anyway
-    assert all({2, 4} <= set(d) for d in drawn[:50]) or sum({2, 4} <= set(d) for d in drawn) > 190
+    assert sum({2, 4} <= set(d) for d in drawn) > 190
     assert KeyframeSet(keyframes.frames[:1], [1.0]).draw(3, generator) == []
 
 
