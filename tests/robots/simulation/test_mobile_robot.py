@@ -159,11 +159,12 @@ def test_the_recording_is_what_happened(put, tmp_path, tiago) -> None:
         assert list(saved["object_names"]) == ["cup"]
         assert saved["object_poses"].shape == (6, 1, 4, 4)
         np.testing.assert_array_equal(saved["object_poses"][-1, 0], robot.world.object_pose("cup"))
-    np.testing.assert_array_equal(robot.recording.first_base_pose(), states[0][:3])
+    np.testing.assert_array_equal(robot.recording.base_poses(), np.array(states)[:, :3])
 
 
 def test_a_recording_without_objects_or_steps_can_be_saved(put, tmp_path) -> None:
     robot = put()
+    assert robot.recording.base_poses().shape == (0, 3) and robot.recording.touched() == {}
     robot.recording.save(tmp_path / "none.npz")
     with np.load(tmp_path / "none.npz") as saved:
         assert saved["time"].shape == (0,) and saved["base_pose"].shape == (0, 3)
