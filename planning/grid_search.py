@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,6 +31,10 @@ class GridSearchConfig:
         caution: how many times longer a way at the least margin counts than one at the margin.
         escape: where the start is blocked, positions this near to it [m] are not, unless they are less clear: the
             robot stands there and may leave, but not go in deeper.
+        through_blocked: how many times longer a way through blocked space counts than a free one, for maps that may
+            be wrong about what was not seen yet. Where no free way leads to the goal, the route then follows the
+            cheapest way through blocked space up to where that begins, such as a doorway. inf: never.
+        closed_radius: blocked space this near [m] to a closed place is never entered.
         workspace: rules for the floor and for unknown space, which counts as blocked.
     """
 
@@ -39,6 +44,8 @@ class GridSearchConfig:
     least_margin: float = 0.0
     caution: float = 10.0
     escape: float = 0.25
+    through_blocked: float = math.inf
+    closed_radius: float = 0.6
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
 
     def __post_init__(self) -> None:
@@ -54,12 +61,15 @@ class Route:
     """A path over the grid.
 
     Args:
-        path: (k, 2) positions [m] from the start to the goal, or to the reachable place nearest to it.
+        path: (k, 2) positions [m] from the start to the goal; or to where blocked space would have to be entered; or
+            to the reachable place nearest to the goal.
         reaches_goal: whether it ends at the goal.
+        entry: (2,) the blocked position that comes next [m], if the path ends before one.
     """
 
     path: Float[Tensor, "k 2"]
     reaches_goal: bool
+    entry: Float[Tensor, "2"] | None = None
 
 
 def grid_search(
@@ -68,6 +78,7 @@ def grid_search(
     start: Float[Tensor, "2"],
     goal: Float[Tensor, "2"],
     config: GridSearchConfig | None = None,
+    closed: Float[Tensor, "c 2"] | None = None,
 ) -> Route:
     """Search the cheapest path of a robot with q = (x, y).
 
@@ -77,6 +88,7 @@ def grid_search(
         start: position [m].
         goal: position [m].
         config: see `GridSearchConfig`.
+        closed: places [m] where blocked space was found to be blocked indeed.
 
     Raises:
         TrajectoryError: if the robot has not two joints, or start or goal is not finite.
@@ -91,19 +103,44 @@ def grid_search(
     positions, shape = _grid(start, goal, config)
     cost = _cost(robot, sdf, positions, start, config)
     near_start, near_goal = (int((positions - p).norm(dim=1).argmin()) for p in (start, goal))
-    graph = _graph(cost.numpy().astype(float), shape, config.spacing)
-    reach, before = dijkstra(graph, indices=near_start, return_predecessors=True)
-    reaches = bool(np.isfinite(reach[near_goal]))
-    end = near_goal
-    if not reaches:
-        gap = (positions - goal).norm(dim=1).numpy()
-        end = int(np.where(np.isfinite(reach), gap, np.inf).argmin())
+    cells, reach = _cheapest(cost, shape, config.spacing, near_start, near_goal)
+    if cells:
+        path = torch.cat([start[None], positions[cells][1:-1], goal[None]])
+        return Route(path, True)
+    optimistic = _through_blocked(cost, positions, closed, config)
+    cells, _ = _cheapest(optimistic, shape, config.spacing, near_start, near_goal)
+    if cells:
+        first = int(torch.isinf(cost[cells]).float().argmax())
+        return Route(torch.cat([start[None], positions[cells[1:first]]]), False, positions[cells[first]])
+    gap = (positions - goal).norm(dim=1).masked_fill(~torch.isfinite(torch.as_tensor(reach)), torch.inf)
+    cells, _ = _cheapest(cost, shape, config.spacing, near_start, int(gap.argmin()))
+    return Route(torch.cat([start[None], positions[cells][1:]]), False)
+
+
+def _cheapest(
+    cost: Float[Tensor, "n"], shape: tuple[int, int], spacing: float, start: int, end: int
+) -> tuple[list[int], Float[ndarray, "n"]]:
+    """Cells of the cheapest path, none if there is no path; and the cost of reaching every cell."""
+    graph = _graph(cost.numpy().astype(float), shape, spacing)
+    reach, before = dijkstra(graph, indices=start, return_predecessors=True)
+    if not np.isfinite(reach[end]):
+        return [], reach
     cells = [end]
-    while cells[-1] != near_start:
+    while cells[-1] != start:
         cells.append(int(before[cells[-1]]))
-    path = positions[cells[::-1]].clone()
-    ends = [start[None], path[1:-1], goal[None] if reaches else path[-1:]]
-    return Route(torch.cat(ends), reaches)
+    return cells[::-1], reach
+
+
+def _through_blocked(
+    cost: Tensor, positions: Tensor, closed: Tensor | None, config: GridSearchConfig
+) -> Float[Tensor, "n"]:
+    """The cost with blocked space passable at its price, but for what is closed."""
+    blocked = torch.isinf(cost)
+    optimistic = cost.masked_fill(blocked, config.through_blocked)
+    if closed is not None and len(closed):
+        near = torch.cdist(positions, closed).amin(dim=1) <= config.closed_radius
+        optimistic = optimistic.masked_fill(blocked & near, torch.inf)
+    return optimistic
 
 
 def _grid(

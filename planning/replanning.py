@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
+from torch import Tensor
 
 from planning.chomp import Chomp, ChompConfig
 from planning.clock import Clock, MeasuredClock, OnlineMap
@@ -70,6 +71,7 @@ class ReplanningConfig:
         scan: angle [rad] turned on the spot at the start, to see what is around.
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
+        looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
         look_ahead: distance along the path [m] at which the camera looks.
         patience: plans in a row that may fail before the goal is called unreachable.
         time_limit: [s] of the robot's time.
@@ -77,7 +79,9 @@ class ReplanningConfig:
 
     # A map still being learned is some centimetres wrong, and the robot stands where it stands: hence the negative
     # least margin.
-    search: GridSearchConfig = field(default_factory=lambda: GridSearchConfig(least_margin=-0.10))
+    search: GridSearchConfig = field(
+        default_factory=lambda: GridSearchConfig(least_margin=-0.05, through_blocked=30.0)
+    )
     chomp: ChompConfig = field(default_factory=lambda: ChompConfig(eps=0.35, max_iterations=120))
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     num_waypoints: int = 40
@@ -86,6 +90,7 @@ class ReplanningConfig:
     scan: float = 2 * math.pi
     scan_rate: float = 0.5
     retry: float = 1.0
+    looks: int = 3
     look_ahead: float = 1.5
     patience: int = 15
     time_limit: float = 180.0
@@ -171,6 +176,7 @@ class ReplanningLoop:
         self._retry_at = -math.inf
         self._to_goal = False
         self._mapped = False
+        self._entries: list[Tensor] = []
 
     def drive_to(self, goal: Float[ndarray, "2"], final_yaw: float | None = None) -> DriveReport:
         """Look around, then map, plan and drive until the goal is reached or given up.
@@ -180,7 +186,7 @@ class ReplanningLoop:
             final_yaw: heading to end with [rad]; any if None.
         """
         started, self.report, self.plan = self.robot.time, DriveReport(), None
-        self._failures, self._retry_at, self._to_goal = 0, -math.inf, False
+        self._failures, self._retry_at, self._to_goal, self._entries = 0, -math.inf, False, []
         self._scan()
         self.tracker.reset()
         while self.robot.time - started < self.config.time_limit:
@@ -264,14 +270,15 @@ class ReplanningLoop:
                 return self.plan
             if not self._route(goal).reaches_goal and not self.tracker.finished:
                 return self.plan
-        fresh, to_goal = self._planned(goal)
+        route = self._route(goal)
+        fresh = self._planned(route)
         self.report.plans += 1
-        gaps = (fresh.trajectory.waypoints - torch.as_tensor(goal, dtype=torch.float32)).norm(dim=1)
-        # Without a least gain the robot could circle a walled-in goal for ever.
-        dead_end = fresh.success and not to_goal and float(gaps[0] - gaps[-1]) < self.config.search.spacing
+        dead_end = fresh.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if fresh.success and not dead_end:
-            self._failures, self._to_goal, self.report.message = 0, to_goal, ""
+            self._failures, self._to_goal, self.report.message = 0, route.reaches_goal, ""
             return fresh
+        if dead_end and route.entry is not None:
+            self._entries.append(route.entry)
         self._failures += 1
         self._retry_at = self.robot.time + self.config.retry
         self.report.failed_plans += 1
@@ -285,15 +292,30 @@ class ReplanningLoop:
         assert self.field is not None
         start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
         end = torch.as_tensor(goal, dtype=torch.float32)
-        return grid_search(self.body, self.field, start, end, self.config.search)
+        return grid_search(self.body, self.field, start, end, self.config.search, self._closed())
 
-    def _planned(self, goal: Float[ndarray, "2"]) -> tuple[PlanResult, bool]:
-        """CHOMP from the best route, or the route itself where CHOMP leaves it; and whether it leads to the goal.
+    def _leads_nowhere(self, route: Route, goal: Float[ndarray, "2"]) -> bool:
+        """Whether the robot already stands where the route ends, or would only circle a walled-in goal."""
+        if route.entry is not None:
+            return float((route.path[-1] - route.path[0]).norm()) < 2 * self.config.search.spacing
+        gaps = (route.path - torch.as_tensor(goal, dtype=torch.float32)).norm(dim=1)
+        return float(gaps[0] - gaps[-1]) < self.config.search.spacing
+
+    def _closed(self) -> Float[Tensor, "c 2"] | None:
+        """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
+        if not self._entries:
+            return None
+        entries = torch.stack(self._entries)
+        visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
+        return entries[visits >= self.config.looks]
+
+    def _planned(self, route: Route) -> PlanResult:
+        """CHOMP from the route, or the route itself where CHOMP leaves it.
 
         The clearance asked for is what the route has, at most the margin; the cost still seeks more.
         """
         assert self.field is not None
-        config, route = self.config, self._route(goal)
+        config = self.config
         path = Trajectory.through(route.path)
         found = check(self.body, path, self.field, config.chomp.validation)
         margin = min(config.margin, found.clearance - 0.005)
@@ -310,7 +332,7 @@ class ReplanningLoop:
                 message=f"the searched route: {verdict.message}",
                 clearance=verdict.clearance,
             )
-        return result, route.reaches_goal
+        return result
 
     def _still_good(self) -> bool:
         """Whether what is left of the plan keeps its clearance on the new map."""
