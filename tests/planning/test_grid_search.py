@@ -219,3 +219,44 @@ def test_a_goal_that_is_no_place_is_refused(bad: float) -> None:
 def test_bad_settings_are_refused(values: dict) -> None:
     with pytest.raises(ConfigError, match="GridSearchConfig"):
         GridSearchConfig(**values)
+
+
+# A wall across the way with a doorway at y = 1.5, and the space behind it taken for solid but for a tongue.
+DOORWAY = Union(
+    Box((1.5, -2.1, 0.5), (0.1, 3.0, 1.0)),
+    Box((1.5, 5.1, 0.5), (0.1, 3.0, 1.0)),
+    Box((3.5, -2.25, 0.5), (2.0, 2.75, 1.0)),
+)
+EXPLORING = GridSearchConfig(through_blocked=30.0)
+
+
+def test_where_no_free_way_leads_on_the_route_ends_before_the_cheapest_blocked_way() -> None:
+    assert not grid_search(ROBOT, DOORWAY, START, GOAL).reaches_goal
+    route = grid_search(ROBOT, DOORWAY, START, GOAL, EXPLORING)
+    assert not route.reaches_goal and route.entry is not None
+    assert float(route.path[-1, 0]) > 2.0, "through the doorway, not up to the wall"
+    assert checked(route, DOORWAY).clearance > -0.03
+    gap = float((route.entry - route.path[-1]).norm())
+    assert gap < 1.5 * EXPLORING.spacing, "the entry is the next cell"
+    assert float(DOORWAY.distance(torch.nn.functional.pad(route.entry, (0, 1)))) < ROBOT.radius
+
+
+def test_closed_places_send_the_route_elsewhere_and_in_the_end_nowhere() -> None:
+    goal, closed, entries = torch.tensor([3.0, -1.5]), torch.zeros(0, 2), []
+    for _ in range(60):
+        route = grid_search(ROBOT, DOORWAY, START, goal, EXPLORING, closed)
+        if route.entry is None:
+            break
+        if len(closed):
+            assert float((closed - route.entry).norm(dim=1).min()) > EXPLORING.closed_radius
+        entries.append(route.entry)
+        closed = torch.stack(entries)
+    assert len(entries) > 2 and route.entry is None
+    nearest = grid_search(ROBOT, DOORWAY, START, goal)
+    torch.testing.assert_close(route.path[-1], nearest.path[-1])
+
+
+def test_a_free_way_is_never_given_up_for_a_shorter_blocked_one() -> None:
+    wall = Box((1.5, 0.0, 0.5), (0.1, 2.0, 1.0))
+    route = grid_search(ROBOT, wall, START, GOAL, replace(EXPLORING, through_blocked=1.0))
+    assert route.reaches_goal and checked(route, wall).clearance > 0

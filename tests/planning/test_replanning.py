@@ -257,3 +257,19 @@ def test_an_empty_report_is_no_success() -> None:
 def test_bad_settings_are_refused(values: dict) -> None:
     with pytest.raises(ConfigError, match="ReplanningConfig"):
         ReplanningConfig(**values)
+
+
+def test_what_the_map_only_takes_for_blocked_is_explored_through_the_doorway() -> None:
+    wall = Union(Box((1.5, -2.1, 0.5), (0.1, 3.0, 1.0)), Box((1.5, 5.1, 0.5), (0.1, 3.0, 1.0)))
+    imagined = Union(wall, Box((3.5, -2.25, 0.5), (2.0, 2.75, 1.0)))
+    robot, seen = Unicycle(), []
+
+    def knows():
+        if robot.state[0] > 1.6 and not seen:  # behind the wall it sees that nothing is there
+            seen.append(robot.time)
+        return wall if seen else imagined
+
+    config = replace(QUICK, search=replace(QUICK.search, through_blocked=30.0), time_limit=120.0)
+    _, report = drive(robot, knows, config)
+    assert seen and report.success
+    assert robot.clearance(BODY, wall) > -0.01
