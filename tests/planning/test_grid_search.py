@@ -248,7 +248,7 @@ def test_closed_places_send_the_route_elsewhere_and_in_the_end_nowhere() -> None
         if route.entry is None:
             break
         if len(closed):
-            assert float((closed - route.entry).norm(dim=1).min()) > EXPLORING.closed_radius
+            assert float((closed - route.entry).norm(dim=1).min()) > 0.99 * EXPLORING.closed_radius
         entries.append(route.entry)
         closed = torch.stack(entries)
     assert len(entries) > 2 and route.entry is None
