@@ -12,6 +12,12 @@ from tests.isdf.rooms import furnished_orbit
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 SNIPPETS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+URDF = """<robot name="r">
+<link name="base"><collision><geometry><box size="0.3 0.2 0.1"/></geometry></collision></link>
+<link name="arm"><collision><origin xyz="0 0 0.2"/><geometry><cylinder radius="0.03" length="0.4"/></geometry>
+</collision></link>
+<joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><origin xyz="0 0 0.1"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
 COMMANDS = re.findall(r"^(?:make|isdf|python -m) .*$", README, flags=re.MULTILINE)
 
 
@@ -29,12 +35,7 @@ def test_the_first_snippet_maps_and_plans(tmp_path, monkeypatch) -> None:
 
 def test_the_robot_snippet_fits_and_builds(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("my_robot.urdf").write_text(
-        '<robot name="r"><link name="base"><collision><geometry><box size="0.3 0.2 0.1"/></geometry></collision>'
-        '</link><link name="arm"><collision><origin xyz="0 0 0.2"/><geometry><cylinder radius="0.03" length="0.4"/></geometry>'
-        '</collision></link><joint name="turn" type="revolute"><parent link="base"/><child link="arm"/>'
-        '<origin xyz="0 0 0.1"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
-    )
+    Path("my_robot.urdf").write_text(URDF)
     names: dict = {}
     exec(SNIPPETS[1], names)
     assert names["robot"].joint_names == ("turn",) and names["report"]
