@@ -35,7 +35,26 @@ def save(mapper: Mapper, path: Path) -> None:
         NotReadyError: no frame has been integrated yet.
         OSError: the folder cannot be written.
     """
-    tensors, header = _state(mapper)
+    write(path, *_state(mapper))
+
+
+def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
+    """Read a map written by `save`.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, of another kind or of a newer version.
+    """
+    tensors, header = read(path, FORMAT, VERSION)
+    try:
+        return _restore(tensors, header, device)
+    except (KeyError, TypeError, IndexError, RuntimeError, AttributeError, IsdfError) as error:
+        raise CheckpointError(
+            f"{path}: the map is incomplete or inconsistent ({error}); map again"
+        ) from error
+
+
+def write(path: Path, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
+    """Write tensors and a JSON header to one file; an existing file is replaced only by a complete new one."""
     data = to_bytes(tensors, metadata={"isdf": json.dumps(header)})
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -50,22 +69,12 @@ def save(mapper: Mapper, path: Path) -> None:
         raise
 
 
-def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
-    """Read a map written by `save`.
+def kind(path: Path) -> str:
+    """The `format` that the header of a map file names.
 
     Raises:
-        CheckpointError: the file is missing, damaged, of another kind or of a newer version.
+        CheckpointError: the file is missing, damaged or no map.
     """
-    tensors, header = _read(path)
-    try:
-        return _restore(tensors, header, device)
-    except (KeyError, TypeError, IndexError, RuntimeError, AttributeError, IsdfError) as error:
-        raise CheckpointError(
-            f"{path}: the map is incomplete or inconsistent ({error}); map again"
-        ) from error
-
-
-def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     if not path.is_file():
         raise CheckpointError(
             f"{path}: no such file; a map is written by mapper.save(path) or `isdf map --out`"
@@ -73,14 +82,30 @@ def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     try:
         with safe_open(str(path), framework="pt") as file:
             header = json.loads((file.metadata() or {}).get("isdf", "null"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, json.JSONDecodeError, OSError) as error:
         raise CheckpointError(f"{path}: not a readable map ({error})") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
+    if not isinstance(header, dict) or not isinstance(header.get("format"), str):
         raise CheckpointError(f"{path}: a safetensors file, but not a map written by this package")
-    if header.get("version") != VERSION:
+    return header["format"]
+
+
+def read(path: Path, expected: str, version: int) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and header of a map file of the expected format and version.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, of another kind or of another version.
+    """
+    found = kind(path)
+    if found != expected:
         raise CheckpointError(
-            f"{path}: map format version {header.get('version')}, this release reads {VERSION}; "
+            f"{path}: a map of format {found!r}, not {expected!r}; isdf.load_map(path) reads every kind"
+        )
+    with safe_open(str(path), framework="pt") as file:
+        header = json.loads(file.metadata()["isdf"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    if header.get("version") != version:
+        raise CheckpointError(
+            f"{path}: map format version {header.get('version')}, this release reads {version}; "
             "update the package or map again"
         )
     return tensors, header

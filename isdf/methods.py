@@ -1,0 +1,50 @@
+"""The mapping methods by name, and the map files of all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from . import checkpoint
+from .errors import CheckpointError, ConfigError
+from .mapper import Mapper, MapperConfig
+from .voxel import ExactConfig, ExactMapper, KinectFusionConfig, KinectFusionMapper
+
+Config = MapperConfig | ExactConfig | KinectFusionConfig
+OnlineMapper = Mapper | ExactMapper | KinectFusionMapper
+
+_FORMATS: dict[str, type[Mapper] | type[ExactMapper] | type[KinectFusionMapper]] = {
+    checkpoint.FORMAT: Mapper,
+    ExactMapper.FORMAT: ExactMapper,
+    KinectFusionMapper.FORMAT: KinectFusionMapper,
+}
+
+
+def new_mapper(config: Config) -> OnlineMapper:
+    """An empty map of the method that the configuration belongs to.
+
+    Raises:
+        ConfigError: it is none of the methods' configurations.
+    """
+    if isinstance(config, MapperConfig):
+        return Mapper(config)
+    if isinstance(config, ExactConfig):
+        return ExactMapper(config)
+    if isinstance(config, KinectFusionConfig):
+        return KinectFusionMapper(config)
+    raise ConfigError(
+        f"no method has a {type(config).__name__}; pass a MapperConfig, ExactConfig or KinectFusionConfig"
+    )
+
+
+def load_map(path: str | Path) -> OnlineMapper:
+    """Read a map file of any method, as its header says.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, of an unknown kind or of another version.
+    """
+    found = checkpoint.kind(Path(path))
+    if found not in _FORMATS:
+        raise CheckpointError(
+            f"{path}: a map of format {found!r}; this release reads {', '.join(_FORMATS)}: update the package"
+        )
+    return _FORMATS[found].load(path)
