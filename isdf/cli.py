@@ -15,7 +15,7 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from .datasets import RecordedSequence
+from .datasets import DepthSequence, open_sequence
 from .errors import ConfigError, IsdfError
 from .field import NeuralField, query
 from .mapper import Mapper, MapperConfig
@@ -33,7 +33,7 @@ class Map:
     """
 
     sequence_dir: tyro.conf.Positional[Path]
-    """Folder with depth/%06d.png, poses.txt and intrinsics.json."""
+    """Recorded folder, ReplicaCAD, Replica, ScanNet, 7-Scenes or TUM RGB-D sequence, or a ROS bag."""
     out: Path
     """Folder for the results; made if missing."""
     steps_per_frame: int | None = None
@@ -62,7 +62,7 @@ class Map:
         if self.steps_per_frame is not None and self.cpu_per_second is not None:
             raise ConfigError("give --steps-per-frame or --cpu-per-second, not both")
         torch.set_num_threads(max(1, self.threads))
-        sequence = RecordedSequence(self.sequence_dir, self.fps)
+        sequence = open_sequence(self.sequence_dir, self.fps)
         config = self._config()
         with tqdm(total=len(sequence), unit="frame", desc="mapping", disable=None) as bar:
 
@@ -80,19 +80,20 @@ class Map:
         presets = {"cpu": MapperConfig(), "paper": MapperConfig.paper(), "released": MapperConfig.released()}
         return dataclasses.replace(presets[self.preset], seed=self.seed, bound=self.bound)
 
-    def _write(self, mapper: Mapper, report: RunReport, sequence: RecordedSequence) -> None:
+    def _write(self, mapper: Mapper, report: RunReport, sequence: DepthSequence) -> None:
         from .meshing import zero_level_mesh
         from .slices import estimate_up, save_slices, slice_heights
 
         self.out.mkdir(parents=True, exist_ok=True)
         mapper.save(self.out / MAP_FILE)
         field = mapper.field()
-        up = estimate_up(sequence.poses) if self.up is None else np.array(self.up) / np.linalg.norm(self.up)
+        poses = sequence.poses[np.isfinite(sequence.poses).all(axis=(1, 2))]
+        up = estimate_up(poses) if self.up is None else np.array(self.up) / np.linalg.norm(self.up)
         mesh = zero_level_mesh(field, self.mesh_spacing, up=up)
         mesh.export(self.out / "mesh.ply")
         heights = list(self.slice_heights) or slice_heights(field, up)
         keyframes = np.array([f.T_world_camera[:3, 3].numpy() for f in mapper.keyframes.frames])
-        save_slices(self.out / "slices.png", field, heights, up, sequence.poses, keyframes)
+        save_slices(self.out / "slices.png", field, heights, up, poses, keyframes)
         summary = dataclasses.asdict(report) | {
             "sequence": self.sequence_dir.name,
             "clock": {"steps_per_frame": self.steps_per_frame, "cpu_per_second": self.cpu_per_second},

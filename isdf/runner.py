@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from .datasets import RecordedSequence
+from .datasets import DepthSequence
 from .errors import ConfigError, DatasetError, FrameError
 from .mapper import Mapper, MapperConfig
 
@@ -30,7 +30,7 @@ class RunReport:
 
 
 def run_every_frame(
-    sequence: RecordedSequence, config: MapperConfig, steps_per_frame: int, progress: Callable[[int], None]
+    sequence: DepthSequence, config: MapperConfig, steps_per_frame: int, progress: Callable[[int], None]
 ) -> tuple[Mapper, RunReport]:
     """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take."""
     if steps_per_frame < 1:
@@ -47,7 +47,7 @@ def run_every_frame(
 
 
 def run_at_rate(
-    sequence: RecordedSequence, config: MapperConfig, cpu_per_second: float, progress: Callable[[int], None]
+    sequence: DepthSequence, config: MapperConfig, cpu_per_second: float, progress: Callable[[int], None]
 ) -> tuple[Mapper, RunReport]:
     """Live: at most `cpu_per_second` CPU seconds for each second of sequence.
 
@@ -82,7 +82,7 @@ def run_at_rate(
     return mapper, _finish(report, mapper, sequence, cpu, wall)
 
 
-def _integrate(mapper: Mapper, sequence: RecordedSequence, index: int, report: RunReport) -> bool:
+def _integrate(mapper: Mapper, sequence: DepthSequence, index: int, report: RunReport) -> bool:
     """Give one frame to the mapper; an unusable one is recorded and passed over, as a live camera's would be."""
     try:
         mapper.integrate(sequence[index])
@@ -94,9 +94,7 @@ def _integrate(mapper: Mapper, sequence: RecordedSequence, index: int, report: R
     return True
 
 
-def _finish(
-    report: RunReport, mapper: Mapper, sequence: RecordedSequence, cpu: float, wall: float
-) -> RunReport:
+def _finish(report: RunReport, mapper: Mapper, sequence: DepthSequence, cpu: float, wall: float) -> RunReport:
     if mapper.frames_seen == 0:
         raise DatasetError(
             f"{sequence.folder}: none of the {len(sequence)} frames could be used; the first was refused because "

@@ -1,5 +1,23 @@
-"""Recorded depth sequences: reading and writing."""
+"""Depth sequences: a recorded folder to read and write, and readers of the layouts that public data comes in."""
 
+from .detect import open_sequence
 from .recorded import RecordedSequence, SequenceWriter
+from .replica import ReplicaCadSequence, ReplicaSequence
+from .rosbag import RosbagSequence
+from .scannet import ScanNetSequence
+from .sequence import DepthSequence
+from .seven_scenes import SevenScenesSequence
+from .tum import TumSequence
 
-__all__ = ["RecordedSequence", "SequenceWriter"]
+__all__ = [
+    "DepthSequence",
+    "RecordedSequence",
+    "ReplicaCadSequence",
+    "ReplicaSequence",
+    "RosbagSequence",
+    "ScanNetSequence",
+    "SequenceWriter",
+    "SevenScenesSequence",
+    "TumSequence",
+    "open_sequence",
+]

@@ -8,65 +8,50 @@ intrinsics.json  fx fy cx cy width height depth_scale, optionally fps and invali
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..camera import PinholeCamera
 from ..errors import DatasetError
-from ..frames import DepthFrame
+from .sequence import DEFAULT_FPS, ImageSequence
 
-DEFAULT_FPS = 30.0
 MAX_DEPTH_VALUE = 65535
 
 
-class RecordedSequence:
+class RecordedSequence(ImageSequence):
     """A folder of depth images with poses and intrinsics, read frame by frame.
 
     Args:
         folder: the sequence folder.
-        fps: frames a second; by default what intrinsics.json says, else 30.
+        fps: frames a second; by default what intrinsics.json says, else 30. Frame i is taken at i / fps.
 
     Raises:
         DatasetError: a file is missing or unreadable; the message names it.
     """
 
+    layout = "recorded folder"
+
     def __init__(self, folder: str | Path, fps: float | None = None) -> None:
-        self.folder = Path(folder)
-        missing = [n for n in ("depth", "poses.txt", "intrinsics.json") if not (self.folder / n).exists()]
+        folder = Path(folder)
+        missing = self.missing(folder)
         if missing:
             raise DatasetError(
-                f"{self.folder}: not a recorded sequence, {', '.join(missing)} missing; expected depth/%06d.png, "
+                f"{folder}: not a recorded sequence, {', '.join(missing)} missing; expected depth/%06d.png, "
                 "poses.txt and intrinsics.json"
             )
-        self.camera, self.depth_scale, self.invalid, recorded_fps = _read_intrinsics(
-            self.folder / "intrinsics.json"
-        )
-        self.fps = float(fps or recorded_fps or DEFAULT_FPS)
-        if not self.fps > 0:
-            raise DatasetError(f"fps must be positive, got {self.fps}")
-        self.indices, self.poses = _read_poses(self.folder / "poses.txt")
+        camera, scale, invalid, recorded_fps = _read_intrinsics(folder / "intrinsics.json")
+        self.indices, poses = _read_poses(folder / "poses.txt")
+        images = [folder / "depth" / f"{index:06d}.png" for index in self.indices]
+        super().__init__(folder, images, poses, camera, scale, invalid, fps or recorded_fps or DEFAULT_FPS)
 
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def __iter__(self) -> Iterator[DepthFrame]:
-        return (self[i] for i in range(len(self)))
-
-    def __getitem__(self, i: int) -> DepthFrame:
-        """Frame i in the order of poses.txt; its time is i / fps.
-
-        Raises:
-            DatasetError: its image is missing, unreadable, or of another size.
-            FrameError: its pixels or its pose cannot be used.
-        """
-        path = self.folder / "depth" / f"{self.indices[i]:06d}.png"
-        depth = read_depth(path, self.depth_scale, self.invalid)
-        return DepthFrame(depth, self.poses[i], self.camera, time=i / self.fps)
+    @staticmethod
+    def missing(folder: Path) -> list[str]:
+        """What keeps a folder from having this layout; empty when it has it."""
+        return [n for n in ("depth", "poses.txt", "intrinsics.json") if not (folder / n).exists()]
 
 
 class SequenceWriter:
@@ -104,22 +89,6 @@ class SequenceWriter:
         with (self.folder / "poses.txt").open("a") as file:
             file.write(f"{self.count} {numbers}\n")
         self.count += 1
-
-
-def read_depth(path: Path, depth_scale: float, invalid: tuple[float, ...] = (0,)) -> Float[np.ndarray, "h w"]:
-    """A depth image in metres, 0 where invalid."""
-    try:
-        with Image.open(path) as image:
-            values = np.array(image)
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path}: missing, though poses.txt lists it") from error
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise DatasetError(f"{path}: not a readable image ({error})") from error
-    if values.ndim != 2:
-        raise DatasetError(f"{path}: a depth image has one channel, this one has shape {values.shape}")
-    depth = values.astype(np.float32) / depth_scale
-    depth[np.isin(values, invalid)] = 0
-    return depth
 
 
 def _read_intrinsics(path: Path) -> tuple[PinholeCamera, float, tuple[float, ...], float | None]:
