@@ -16,6 +16,7 @@ from .frames import DepthFrame
 from .keyframes import KeyframeConfig
 from .losses import LossConfig
 from .mapper import Mapper, MapperConfig
+from .methods import load_map
 from .network import NetworkConfig
 from .sampling import SamplingConfig
 
@@ -39,5 +40,6 @@ __all__ = [
     "PinholeCamera",
     "SamplingConfig",
     "bake",
+    "load_map",
     "query",
 ]

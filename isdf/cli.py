@@ -17,9 +17,11 @@ from tqdm import tqdm
 
 from .datasets import DepthSequence, open_sequence
 from .errors import ConfigError, IsdfError
-from .field import NeuralField, query
-from .mapper import Mapper, MapperConfig
+from .field import query
+from .mapper import MapperConfig
+from .methods import Config, OnlineMapper, load_map
 from .runner import RunReport, run_at_rate, run_every_frame
+from .voxel import ExactConfig, KinectFusionConfig, VoxelMapper
 
 MAP_FILE = "map.safetensors"
 
@@ -40,6 +42,11 @@ class Map:
     """Optimisation steps on every frame."""
     cpu_per_second: float | None = None
     """CPU seconds allowed for each second of sequence; 1.0 when neither clock is given."""
+    method: Literal["isdf", "exact", "kinectfusion"] = "isdf"
+    """isdf: the neural field. exact: distances to sub-voxel surface points of a TSDF. kinectfusion: the paper's
+    KinectFusion+. The voxel methods need no steps and no more time than fusion takes."""
+    voxel: float | None = None
+    """Edge of a voxel of the voxel methods [m]; by default 0.04 (exact) and 0.07 (kinectfusion)."""
     preset: Literal["cpu", "paper", "released"] = "cpu"
     """cpu: small network, few rays. paper: the text's sizes. released: those behind the published results."""
     bound: Literal["ray", "normal", "batch"] = "batch"
@@ -76,11 +83,20 @@ class Map:
                 mapper, report = run_at_rate(sequence, config, rate, progress)
         self._write(mapper, report, sequence)
 
-    def _config(self) -> MapperConfig:
+    def _config(self) -> Config:
+        if self.method != "isdf":
+            if self.preset != "cpu" or self.bound != "batch":
+                raise ConfigError(
+                    f"--preset and --bound belong to --method isdf; leave them out for {self.method}"
+                )
+            config = ExactConfig() if self.method == "exact" else KinectFusionConfig()
+            return config if self.voxel is None else dataclasses.replace(config, voxel=self.voxel)
+        if self.voxel is not None:
+            raise ConfigError("--voxel belongs to the voxel methods: add --method exact or kinectfusion")
         presets = {"cpu": MapperConfig(), "paper": MapperConfig.paper(), "released": MapperConfig.released()}
         return dataclasses.replace(presets[self.preset], seed=self.seed, bound=self.bound)
 
-    def _write(self, mapper: Mapper, report: RunReport, sequence: DepthSequence) -> None:
+    def _write(self, mapper: OnlineMapper, report: RunReport, sequence: DepthSequence) -> None:
         from .meshing import zero_level_mesh
         from .slices import estimate_up, save_slices, slice_heights
 
@@ -92,11 +108,13 @@ class Map:
         mesh = zero_level_mesh(field, self.mesh_spacing, up=up)
         mesh.export(self.out / "mesh.ply")
         heights = list(self.slice_heights) or slice_heights(field, up)
-        keyframes = np.array([f.T_world_camera[:3, 3].numpy() for f in mapper.keyframes.frames])
+        frames = [] if isinstance(mapper, VoxelMapper) else mapper.keyframes.frames
+        keyframes = np.array([f.T_world_camera[:3, 3].numpy() for f in frames]).reshape(-1, 3)
         save_slices(self.out / "slices.png", field, heights, up, poses, keyframes)
         summary = dataclasses.asdict(report) | {
             "sequence": self.sequence_dir.name,
             "clock": {"steps_per_frame": self.steps_per_frame, "cpu_per_second": self.cpu_per_second},
+            "method": self.method,
             "preset": self.preset,
             "config": dataclasses.asdict(mapper.config),
             "bounds": mapper.bounds.tolist(),
@@ -127,7 +145,7 @@ class Query:
     def run(self) -> None:
         """Load, query, write."""
         path = self.run_dir / MAP_FILE if self.run_dir.is_dir() else self.run_dir
-        field: NeuralField = Mapper.load(path).field()
+        field = load_map(path).field()
         try:
             points = np.load(self.points, allow_pickle=False)
         except (OSError, ValueError) as error:

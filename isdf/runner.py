@@ -9,7 +9,9 @@ from dataclasses import dataclass, field, replace
 
 from .datasets import DepthSequence
 from .errors import ConfigError, DatasetError, FrameError
-from .mapper import Mapper, MapperConfig
+from .mapper import MapperConfig
+from .methods import Config, OnlineMapper, new_mapper
+from .voxel import VoxelMapper
 
 logger = logging.getLogger(__name__)
 
@@ -30,15 +32,19 @@ class RunReport:
 
 
 def run_every_frame(
-    sequence: DepthSequence, config: MapperConfig, steps_per_frame: int, progress: Callable[[int], None]
-) -> tuple[Mapper, RunReport]:
-    """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take."""
+    sequence: DepthSequence, config: Config, steps_per_frame: int, progress: Callable[[int], None]
+) -> tuple[OnlineMapper, RunReport]:
+    """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take.
+
+    Voxel maps have no steps and only integrate.
+    """
     if steps_per_frame < 1:
         raise ConfigError(f"steps_per_frame must be at least 1, got {steps_per_frame}")
-    config = replace(
-        config, first_frame_steps=steps_per_frame, steps_per_frame=steps_per_frame, keyframe_steps=0
-    )
-    mapper, report = Mapper(config), RunReport()
+    if isinstance(config, MapperConfig):
+        config = replace(
+            config, first_frame_steps=steps_per_frame, steps_per_frame=steps_per_frame, keyframe_steps=0
+        )
+    mapper, report = new_mapper(config), RunReport()
     cpu, wall = time.process_time(), time.perf_counter()
     for index in range(len(sequence)):
         _integrate(mapper, sequence, index, report)
@@ -47,33 +53,38 @@ def run_every_frame(
 
 
 def run_at_rate(
-    sequence: DepthSequence, config: MapperConfig, cpu_per_second: float, progress: Callable[[int], None]
-) -> tuple[Mapper, RunReport]:
+    sequence: DepthSequence, config: Config, cpu_per_second: float, progress: Callable[[int], None]
+) -> tuple[OnlineMapper, RunReport]:
     """Live: at most `cpu_per_second` CPU seconds for each second of sequence.
 
     The sequence's clock advances with the CPU time used. When the mapper is ready for another frame it gets the
-    newest that has arrived; those it missed are dropped. While none has arrived it trains on.
+    newest that has arrived; those it missed are dropped. While none has arrived it trains on; a voxel map, which has
+    nothing to train, waits for it: the clock is moved on to then.
     """
     if not cpu_per_second > 0:
         raise ConfigError(f"cpu_per_second must be positive, got {cpu_per_second}")
-    live = replace(config, first_frame_steps=0, steps_per_frame=0, keyframe_steps=0)
-    mapper, report = Mapper(live), RunReport()
+    live, frame_steps = config, 0
+    if isinstance(config, MapperConfig):
+        live = replace(config, first_frame_steps=0, steps_per_frame=0, keyframe_steps=0)
+        frame_steps = config.steps_per_frame
+    mapper, report = new_mapper(live), RunReport()
     cpu, wall = time.process_time(), time.perf_counter()
     budget = len(sequence) / sequence.fps * cpu_per_second
-    patience, last = config.steps_per_frame, -1
-    while (used := time.process_time() - cpu) < budget:
+    patience, last, waited = frame_steps, -1, 0.0
+    while (used := time.process_time() - cpu + waited) < budget:
         newest = min(int(used / cpu_per_second * sequence.fps), len(sequence) - 1)
         if newest > last and _integrate(mapper, sequence, newest, report):
-            patience = config.steps_per_frame
+            patience = frame_steps
         last = newest
         progress(newest + 1)
-        if mapper.frames_seen == 0:  # nothing usable yet: wait for the next frame without burning time
+        # Nothing usable yet, or nothing to train: wait for the next frame without burning time.
+        if mapper.frames_seen == 0 or isinstance(mapper, VoxelMapper):
             newest_time = (newest + 1) / sequence.fps * cpu_per_second
-            cpu -= max(0.0, newest_time - (time.process_time() - cpu))
+            waited += max(0.0, newest_time - (time.process_time() - cpu + waited))
             continue
         # The paper's rule: a new frame gets its steps before the next one is looked for.
         for _ in range(max(1, patience)):
-            if time.process_time() - cpu >= budget:
+            if time.process_time() - cpu + waited >= budget:
                 break
             mapper.step()
         patience = 1
@@ -82,7 +93,7 @@ def run_at_rate(
     return mapper, _finish(report, mapper, sequence, cpu, wall)
 
 
-def _integrate(mapper: Mapper, sequence: DepthSequence, index: int, report: RunReport) -> bool:
+def _integrate(mapper: OnlineMapper, sequence: DepthSequence, index: int, report: RunReport) -> bool:
     """Give one frame to the mapper; an unusable one is recorded and passed over, as a live camera's would be."""
     try:
         mapper.integrate(sequence[index])
@@ -94,13 +105,19 @@ def _integrate(mapper: Mapper, sequence: DepthSequence, index: int, report: RunR
     return True
 
 
-def _finish(report: RunReport, mapper: Mapper, sequence: DepthSequence, cpu: float, wall: float) -> RunReport:
+def _finish(
+    report: RunReport, mapper: OnlineMapper, sequence: DepthSequence, cpu: float, wall: float
+) -> RunReport:
     if mapper.frames_seen == 0:
         raise DatasetError(
             f"{sequence.folder}: none of the {len(sequence)} frames could be used; the first was refused because "
             f"{next(iter(report.frames_refused.values()), 'it never arrived')}"
         )
-    report.frames, report.keyframes, report.steps = len(sequence), len(mapper.keyframes), mapper.steps
+    if isinstance(mapper, VoxelMapper):
+        mapper.refresh()
+    else:
+        report.keyframes = len(mapper.keyframes)
+    report.frames, report.steps = len(sequence), mapper.steps
     report.sequence_seconds = len(sequence) / sequence.fps
     report.cpu_seconds, report.wall_seconds = time.process_time() - cpu, time.perf_counter() - wall
     return report

