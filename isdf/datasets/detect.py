@@ -15,8 +15,8 @@ from .tum import TumSequence
 
 LAYOUTS = (
     RecordedSequence,
+    ReplicaCadSequence,  # before Replica, whose cam_params.json may lie in the folder above both
     ReplicaSequence,
-    ReplicaCadSequence,
     ScanNetSequence,
     SevenScenesSequence,
     TumSequence,

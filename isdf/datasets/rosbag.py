@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 IMAGE, COMPRESSED, CAMERA_INFO = (f"sensor_msgs/msg/{n}" for n in ("Image", "CompressedImage", "CameraInfo"))
 # REP 118: depth images are 32FC1 in metres or 16UC1 in millimetres; some drivers call the latter mono16.
 SCALES = {"32FC1": 1.0, "16UC1": 1000.0, "mono16": 1000.0}
+SUFFIXES = (".bag", ".mcap", ".db3")
 COMPRESSED_HEADER = 12  # bytes that compressed_depth_image_transport writes before the PNG
 INSTALL = "reading ROS bags needs the rosbags package: pip install 'isdf-planning[readers]'"
 
@@ -37,7 +38,7 @@ class RosbagSequence:
     camera_info, or its P where the depth topic's name says it is rectified.
 
     Args:
-        path: a ROS 1 .bag file, or a ROS 2 bag's folder (with metadata.yaml; sqlite3 or mcap).
+        path: a ROS 1 .bag file, a ROS 2 bag's folder (with metadata.yaml), or a single .mcap or .db3 file of one.
         fps: frames a second; by default from the time stamps.
         depth_topic: 16UC1 [mm], 32FC1 [m] or 16UC1 compressedDepth images.
         info_topic: their CameraInfo; by default camera_info beside the depth topic.
@@ -91,8 +92,8 @@ class RosbagSequence:
     @staticmethod
     def missing(folder: Path) -> list[str]:
         """What keeps a path from being a bag; empty when it is one."""
-        is_bag = folder.suffix == ".bag" if folder.is_file() else (folder / "metadata.yaml").is_file()
-        return [] if is_bag else ["a .bag file or metadata.yaml"]
+        is_bag = folder.suffix in SUFFIXES if folder.is_file() else (folder / "metadata.yaml").is_file()
+        return [] if is_bag else [f"a {', '.join(SUFFIXES)} file, or a folder with metadata.yaml"]
 
     def __len__(self) -> int:
         return len(self._places)
@@ -158,7 +159,7 @@ class RosbagSequence:
             raise DatasetError(f"{self.folder}: no message on {topic}")
         # ROS 1 writes the matrices' names in capitals.
         K, P, D = (np.asarray(getattr(info, n, getattr(info, n.lower(), ()))) for n in "KPD")
-        rectified = "rect" in self.depth_topic and P.any()
+        rectified = "image_rect" in self.depth_topic and P.any()
         if D.any() and not rectified:
             logger.warning("%s: the lens distortion of %s is not corrected", self.folder, topic)
         M = P.reshape(3, 4) if rectified else K.reshape(3, 3)

@@ -158,6 +158,7 @@ def test_replica_cad_reads_noisy_or_clean_depth_with_the_released_camera(tmp_pat
     np.savetxt(folder / "traj.txt", make_poses(2).reshape(2, 16))
     assert_reads(ReplicaCadSequence(folder), clean * 1.1, make_poses(2))
     assert_reads(ReplicaCadSequence(folder, noisy=False), clean, make_poses(2))
+    (tmp_path / "cam_params.json").write_text("{}")  # of other sequences in the same folder
     sequence = open_sequence(folder)
     assert isinstance(sequence, ReplicaCadSequence)
     assert sequence.camera == PinholeCamera(600.0, 600.0, 599.5, 339.5, 1200, 680)
@@ -166,7 +167,7 @@ def test_replica_cad_reads_noisy_or_clean_depth_with_the_released_camera(tmp_pat
 def test_unmarked_results_are_refused_since_their_scale_is_unknown(tmp_path) -> None:
     write_replica(tmp_path, shared=False)
     (tmp_path / "cam_params.json").unlink()
-    with pytest.raises(DatasetError, match=r"cam_params\.json .* results/ndepth%06d\.png"):
+    with pytest.raises(DatasetError, match=r"results/ndepth%06d\.png; .*: cam_params\.json"):
         open_sequence(tmp_path)
 
 
@@ -242,8 +243,7 @@ def test_a_calibration_beside_the_frames_overrules_the_nominal_one(tmp_path) -> 
 
 
 def test_a_scene_of_several_sequences_says_which_to_give(tmp_path) -> None:
-    write_seven_scenes_folder = tmp_path / "chess" / "seq-02"
-    write_seven_scenes_folder.mkdir(parents=True)
+    (tmp_path / "chess" / "seq-02").mkdir(parents=True)
     with pytest.raises(DatasetError, match="it holds seq-02: give one of them"):
         open_sequence(tmp_path / "chess")
 

@@ -154,6 +154,43 @@ def test_images_and_a_pose_topic_are_found_and_interpolated(bag, encoding) -> No
     assert RosbagSequence(bag.path, fps=5.0)[1].time == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize("kind", ["PoseWithCovarianceStamped", "TransformStamped"])
+def test_other_pose_messages(bag, kind) -> None:
+    with bag:
+        write_images(bag)
+        for t in POSE_STAMPS:
+            header = bag.header(t, "world")
+            if kind == "TransformStamped":
+                p, q = bag.position_and_quaternion(steady_motion(t), "Vector3")
+                transform = bag.make("geometry_msgs/msg/Transform", translation=p, rotation=q)
+                fields = {"transform": transform, "child_frame_id": OPTICAL}
+            else:
+                pose = bag.pose(steady_motion(t))
+                covariance = np.zeros(36)
+                fields = {
+                    "pose": bag.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance)
+                }
+            bag.write("/pose", t, bag.make(f"geometry_msgs/msg/{kind}", header=header, **fields))
+    assert_reads(open_sequence(bag.path), make_depths(3), TRUTH)
+
+
+def test_single_files_of_ros_2_bags_and_two_images_at_one_bag_time(tmp_path) -> None:
+    with BagWriter(tmp_path / "bag", ros2=True) as bag:
+        write_images(bag)
+        for t in POSE_STAMPS:
+            bag.pose_stamped("/pose", t, steady_motion(t))
+        late = bag.header(0.2, OPTICAL)  # recorded with the image before it, as when a queue is emptied
+        values = np.full((CAMERA.height, CAMERA.width), 2500, "<u2").view(np.uint8)
+        size = {"height": CAMERA.height, "width": CAMERA.width, "step": 2 * CAMERA.width}
+        fields = {"encoding": "mono16", "is_bigendian": 0, "data": values.ravel()}
+        bag.write(DEPTH, STAMPS[2], bag.make("sensor_msgs/msg/Image", header=late, **size, **fields))
+    sequence = open_sequence(next(bag.path.glob("*.db3")))
+    torch.testing.assert_close(
+        sequence[2].depth, torch.from_numpy(make_depths(3)[2]).float(), atol=1e-3, rtol=0
+    )
+    assert len(sequence) == 4 and (sequence[3].depth == 2.5).all()
+
+
 def test_odometry_of_the_base_is_joined_to_the_camera_by_tf(bag) -> None:
     with bag:
         write_images(bag)
