@@ -12,7 +12,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from .errors import ConfigError
-from .field import GridField, bake
+from .field import GridField, bake, grid_points
 
 MAX_CELLS = 60_000_000
 
@@ -24,7 +24,7 @@ def zero_level_mesh(
     padding: float = 0.1,
     up: np.ndarray | None = None,
 ) -> trimesh.Trimesh:
-    """Marching cubes over the region a field was learned in.
+    """Marching cubes over the region a field was learned in; only where the field's `confidence`, if any, is not 0.
 
     Args:
         field: a distance field; `bounds` is taken from it unless given.
@@ -48,16 +48,29 @@ def zero_level_mesh(
             f"(at most {MAX_CELLS:.1g}); choose a spacing of {spacing * (cells / MAX_CELLS) ** (1 / 3):.3f} m or more"
         )
     grid = field if isinstance(field, GridField) and bounds is None else bake(field, region, spacing, padding)
-    return _march(grid, np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, dtype=float))
+    observed = _observed_cells(field, grid) if hasattr(field, "confidence") else None
+    return _march(grid, observed, np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, dtype=float))
 
 
-def _march(grid: GridField, up: np.ndarray) -> trimesh.Trimesh:
+def _observed_cells(field: Any, grid: GridField) -> np.ndarray:
+    """Which cells have eight corners of some confidence, by their highest corner; of the shape of the grid."""
+    known = (field.confidence(grid_points(grid.bounds, grid.spacing)) > 0).cpu().numpy()
+    known = known[tuple(slice(n) for n in grid.values.shape)]
+    for axis in range(3):
+        known &= np.roll(known, 1, axis)
+    return known
+
+
+def _march(grid: GridField, observed: np.ndarray | None, up: np.ndarray) -> trimesh.Trimesh:
     values = grid.values.cpu().numpy()
     if not values.min() < 0 < values.max():
         return trimesh.Trimesh()
-    vertices, faces, _, _ = marching_cubes(
-        values, level=0.0, spacing=(grid.spacing,) * 3, gradient_direction="ascent"
-    )
+    try:
+        vertices, faces, _, _ = marching_cubes(
+            values, level=0.0, spacing=(grid.spacing,) * 3, gradient_direction="ascent", mask=observed
+        )
+    except RuntimeError:  # no crossing in any of the observed cells
+        return trimesh.Trimesh()
     vertices = vertices + grid.origin.cpu().numpy()
     normals = trimesh.Trimesh(vertices, faces, process=False).vertex_normals
     grey = np.clip(255 * (0.55 + 0.35 * (normals @ up)), 30, 255).astype(np.uint8)

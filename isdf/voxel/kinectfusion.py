@@ -28,8 +28,8 @@ class KinectFusionConfig:
     Args:
         voxel: edge of a voxel [m].
         front: a voxel is hit from this far in front of the measured surface, along the view [voxels]. More thickens
-            what is seen from the front, less leaves holes where it is seen at a flat angle.
-        behind: and to this far behind it [voxels].
+            surfaces, less lets rays at a flat angle wear them away.
+        behind: and to this far behind it [voxels]; thin plates seen at a flat angle vanish with one voxel.
         hit: log odds added by a hit.
         miss: log odds taken away by a ray that passes through.
         max_depth: pixels measured farther than this are ignored [m].
@@ -38,8 +38,8 @@ class KinectFusionConfig:
     """
 
     voxel: float = 0.07
-    front: float = 0.75
-    behind: float = 1.0
+    front: float = 0.5
+    behind: float = 2.0
     hit: float = 0.85
     miss: float = 0.4
     max_depth: float = 12.0

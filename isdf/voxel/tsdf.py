@@ -25,7 +25,8 @@ class TsdfConfig:
         truncation: least truncation [m], some standard deviations of near depth.
         truncation_noise: truncation per squared depth [m / m^2]: it follows the noise of far depth.
         max_depth: pixels measured farther than this are ignored [m].
-        max_weight: of a voxel, in measurements at 1 m; lower forgets faster what has moved.
+        max_weight: of a voxel, in measurements at 1 m: enough to average the noise, and lower forgets sooner what has
+            moved. A measurement at depth z weighs z^-4 of one at 1 m, so things seen from near fade slowly from afar.
         max_voxels: a frame that needs a larger volume is refused.
     """
 
@@ -34,7 +35,7 @@ class TsdfConfig:
     truncation: float = 0.12
     truncation_noise: float = 0.012
     max_depth: float = 12.0
-    max_weight: float = 100.0
+    max_weight: float = 20.0
     max_voxels: int = 64_000_000
 
     def __post_init__(self) -> None:

@@ -26,6 +26,7 @@ from isdf import (
 )
 from isdf.cli import main
 from isdf.datasets import RecordedSequence, SequenceWriter
+from isdf.meshing import zero_level_mesh
 from isdf.methods import load_map
 from isdf.runner import run_at_rate
 from isdf.slices import draw_slice
@@ -37,6 +38,7 @@ from isdf.voxel import (
     TsdfConfig,
     TsdfVolume,
 )
+from isdf.voxel.nearest_seed import observed_at
 from isdf.voxel.surface import surface_seeds
 from tests.isdf.rooms import furnished_orbit, furnished_room, look_at, render
 
@@ -112,6 +114,15 @@ def test_the_unseen_has_no_confidence(rooms, method) -> None:
     field = rooms[method].field()
     assert field.confidence(unseen).tolist() == [0.0] * 5 and field.confidence(seen).tolist() == [1.0] * 2
     assert query(field, seen.numpy())["confidence"].tolist() == [1.0, 1.0]
+
+
+def test_outside_the_volume_nothing_was_observed() -> None:
+    """Also beside a corner that was."""
+    points = torch.tensor(
+        [[1.0, 1.0, 1.0], [1.04, 1.0, 0.96], [1.3, 1.0, 1.0], [0.9, 1.0, 1.0], [0.0, 0.0, 0.0]]
+    )
+    observed = observed_at(torch.ones(3, 3, 3, dtype=torch.bool), torch.ones(3), 0.1, points)
+    assert observed.tolist() == [1.0, 1.0, 0.0, 0.0, 0.0]
 
 
 @every_method
@@ -239,6 +250,15 @@ def test_what_has_moved_away_is_forgotten(method) -> None:
         mapper.integrate(far)
     mapper.refresh()
     assert mapper.field().distance(here).item() == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_weight_of_the_past_is_limited() -> None:
+    """What was seen often before it moved must not count for ever."""
+    camera = PinholeCamera.from_fov(80, 60, math.radians(60))
+    volume = TsdfVolume(TsdfConfig(max_weight=5.0))
+    for _ in range(20):
+        volume.fuse(DepthFrame(torch.full((60, 80), 1.0), np.eye(4), camera))
+    assert volume.weight.max() == 5.0
 
 
 @every_method
@@ -374,6 +394,17 @@ def test_the_live_clock_waits_for_frames_and_drops_what_it_is_too_slow_for(metho
     mapper, scarce = run_at_rate(sequence, config, 0.02, lambda _: None)
     assert 0 < scarce.frames_used < 12 and scarce.frames_used + scarce.frames_dropped == 12
     assert mapper.field() is not None and scarce.steps >= 1
+
+
+@every_method
+def test_the_mesh_has_no_faces_where_nothing_was_seen(rooms, method) -> None:
+    field = rooms[method].field()
+    mesh = zero_level_mesh(field, 0.05)
+    centres = torch.from_numpy(mesh.triangles_center).float()
+    assert len(centres) > 5000 and field.confidence(centres).mean() > 0.98
+    assert (field.distance(centres).abs() < 0.05).float().mean() > 0.99
+    nothing = field.bounds[1] + torch.tensor([[1.0], [2.0]])
+    assert len(zero_level_mesh(field, 0.05, nothing).faces) == 0
 
 
 def test_slices_are_grey_where_nothing_was_seen(rooms) -> None:
