@@ -400,7 +400,7 @@ def test_the_live_clock_waits_for_frames_and_drops_what_it_is_too_slow_for(metho
 def test_the_mesh_has_no_faces_where_nothing_was_seen(rooms, method) -> None:
     field = rooms[method].field()
     mesh = zero_level_mesh(field, 0.05)
-    centres = torch.from_numpy(mesh.triangles_center).float()
+    centres = torch.tensor(mesh.triangles_center.astype(np.float32))
     assert len(centres) > 5000 and field.confidence(centres).mean() > 0.98
     assert (field.distance(centres).abs() < 0.05).float().mean() > 0.99
     nothing = field.bounds[1] + torch.tensor([[1.0], [2.0]])
