@@ -22,7 +22,8 @@ from examples.arm import Grasp, execute, grasp_candidates, parked, plan_reach, w
 from examples.episode import Episode, EpisodeOptions
 from examples.pictures import Film, save_map_picture
 from examples.report import write_report
-from planning.replanning import DriveReport, ReplanningConfig, ReplanningLoop
+from planning.drive import DriveReport
+from planning.replanning import ReplanningConfig, ReplanningLoop
 from robots.simulation import GraspTask
 
 LIFTED, HELD_FOR = 0.10, 2.0

@@ -21,7 +21,8 @@ from examples.episode import Episode, EpisodeOptions
 from examples.pictures import Film, save_map_picture
 from examples.report import write_report
 from isdf.meshing import zero_level_mesh
-from planning.replanning import DriveReport, ReplanningConfig, ReplanningLoop
+from planning.drive import DriveReport
+from planning.replanning import ReplanningConfig, ReplanningLoop
 
 
 @dataclass(frozen=True)

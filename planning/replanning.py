@@ -1,60 +1,30 @@
 """The closed loop: sense, map, plan, follow, and plan again when the map changes what the plan is worth.
 
-It knows a robot, a map and a world only by the Protocols here and in `planning.protocols`.
+It knows a robot, a map and a world only by the Protocols of `planning.drive`, `planning.clock` and
+`planning.protocols`.
 """
 
 from __future__ import annotations
 
-import enum
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from torch import Tensor
 
-from planning.chomp import Chomp, ChompConfig
+from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.clock import Clock, MeasuredClock, OnlineMap
+from planning.drive import DriveReport, DriveStatus, MobileRobot
 from planning.errors import ConfigError
-from planning.grid_search import GridSearchConfig, Route, grid_search
 from planning.protocols import DistanceField, SphereRobot
 from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
-from planning.trajectory import Trajectory
-from planning.validation import check
 
 logger = logging.getLogger(__name__)
-
-
-@runtime_checkable
-class MobileRobot(Protocol):
-    """The robot and its world, real or simulated: it senses, drives, and lets time pass."""
-
-    @property
-    def time(self) -> float:
-        """Now [s]."""
-        ...
-
-    def base_state(self) -> Float[ndarray, "3"]:
-        """x, y [m] and yaw [rad] of the base."""
-        ...
-
-    def observe(self) -> Any | None:
-        """The newest depth frame, without the robot's own body; None if there is no new one."""
-        ...
-
-    def look_at(self, point: Float[ndarray, "3"]) -> None:
-        """Turn the camera towards a world point [m] as far as it goes."""
-        ...
-
-    def drive(self, v: float, omega: float, duration: float) -> None:
-        """Drive at v [m/s] and omega [rad/s] for some time [s]."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -62,78 +32,31 @@ class ReplanningConfig:
     """How the loop drives.
 
     Args:
-        search: finds the route that CHOMP starts from.
-        chomp: the optimiser; its margin is set by the loop.
+        planner: how the base plans.
         tracker: the base controller.
-        num_waypoints: of a plan.
-        margin: clearance [m] that plans keep where the map has a route with as much.
-        clearance_change: a plan is made anew when the map has taken this much [m] of its clearance.
         scan: angle [rad] turned on the spot at the start, to see what is around.
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
-        looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
         look_ahead: distance along the path [m] at which the camera looks.
         patience: plans in a row that may fail before the goal is called unreachable.
         time_limit: [s] of the robot's time.
     """
 
-    # A map still being learned is some centimetres wrong, and the robot stands where it stands: hence the negative
-    # least margin.
-    search: GridSearchConfig = field(
-        default_factory=lambda: GridSearchConfig(least_margin=-0.05, through_blocked=30.0)
-    )
-    chomp: ChompConfig = field(default_factory=lambda: ChompConfig(eps=0.35, max_iterations=120))
+    planner: BasePlannerConfig = field(default_factory=BasePlannerConfig)
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
-    num_waypoints: int = 40
-    margin: float = 0.05
-    clearance_change: float = 0.05
     scan: float = 2 * math.pi
     scan_rate: float = 0.5
     retry: float = 1.0
-    looks: int = 3
     look_ahead: float = 1.5
     patience: int = 15
     time_limit: float = 180.0
 
     def __post_init__(self) -> None:
-        positive = (self.clearance_change, self.scan_rate, self.retry, self.time_limit)
-        if min(positive) <= 0 or self.num_waypoints < 3 or self.margin < self.search.least_margin:
+        if not min(self.scan_rate, self.retry, self.time_limit) > 0:
             raise ConfigError(
-                "ReplanningConfig: clearance_change, scan_rate, retry and time_limit must be positive, num_waypoints "
-                f"at least 3 and margin at least search.least_margin, got {self}."
+                f"ReplanningConfig: scan_rate, retry and time_limit must be positive, got {self.scan_rate:g} rad/s, "
+                f"{self.retry:g} s and {self.time_limit:g} s."
             )
-
-
-class DriveStatus(enum.Enum):
-    """How a drive ended."""
-
-    REACHED = "reached"
-    UNREACHABLE = "unreachable"
-    TIME_LIMIT = "time limit"
-
-
-@dataclass
-class DriveReport:
-    """What happened on a drive. Times in seconds, lengths in metres."""
-
-    status: DriveStatus = DriveStatus.TIME_LIMIT
-    message: str = ""
-    duration: float = 0.0
-    path_length: float = 0.0
-    goal_distance: float = math.inf
-    rounds: int = 0
-    plans: int = 0
-    failed_plans: int = 0
-    frames: int = 0
-    frames_refused: int = 0
-    mapping_seconds: float = 0.0
-    planning_seconds: float = 0.0
-    slowest_plan: float = 0.0
-
-    @property
-    def success(self) -> bool:
-        """True if the goal was reached."""
-        return self.status is DriveStatus.REACHED
 
 
 class ReplanningLoop:
@@ -164,9 +87,10 @@ class ReplanningLoop:
         watch: Callable[[ReplanningLoop], None] | None = None,
         seed: int = 0,
     ) -> None:
-        self.robot, self.body, self.mapper, self.snapshot = robot, body, mapper, snapshot
+        self.robot, self.mapper, self.snapshot = robot, mapper, snapshot
         self.config, self.clock = config or ReplanningConfig(), clock or MeasuredClock()
-        self.watch, self.seed = watch, seed
+        self.watch = watch
+        self.planner = BasePlanner(body, self.config.planner, seed)
         self.tracker = BaseTracker(self.config.tracker)
         self.plan: PlanResult | None = None
         self.field: DistanceField | None = None
@@ -176,7 +100,6 @@ class ReplanningLoop:
         self._retry_at = -math.inf
         self._to_goal = False
         self._mapped = False
-        self._entries: list[Tensor] = []
 
     def drive_to(self, goal: Float[ndarray, "2"], final_yaw: float | None = None) -> DriveReport:
         """Look around, then map, plan and drive until the goal is reached or given up.
@@ -186,7 +109,8 @@ class ReplanningLoop:
             final_yaw: heading to end with [rad]; any if None.
         """
         started, self.report, self.plan = self.robot.time, DriveReport(), None
-        self._failures, self._retry_at, self._to_goal, self._entries = 0, -math.inf, False, []
+        self._failures, self._retry_at, self._to_goal = 0, -math.inf, False
+        self.planner.forget()
         self._scan()
         self.tracker.reset()
         while self.robot.time - started < self.config.time_limit:
@@ -259,96 +183,25 @@ class ReplanningLoop:
 
     def _decide(self, goal: Float[ndarray, "2"]) -> PlanResult | None:
         """Keep the plan while it is good; else make one, to the goal or as near to it as the map allows."""
-        if not self._mapped:
-            self.report.message = "no usable frame has come in yet"
-            self._failures += 1
-            self._retry_at = self.robot.time + self.config.retry
-            return None
         self.field = self.snapshot()
-        if self._still_good():
+        start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
+        end = torch.as_tensor(goal, dtype=torch.float32)
+        if self.plan is not None and self.planner.still_good(self.plan, start, self.field):
             if self._to_goal:
                 return self.plan
-            if not self._route(goal).reaches_goal and not self.tracker.finished:
+            if not self.tracker.finished and not self.planner.route(start, end, self.field).reaches_goal:
                 return self.plan
-        route = self._route(goal)
-        fresh = self._planned(route)
+        fresh = self.planner.plan(start, end, self.field)
         self.report.plans += 1
-        dead_end = fresh.success and not route.reaches_goal and self._leads_nowhere(route, goal)
-        if fresh.success and not dead_end:
-            self._failures, self._to_goal, self.report.message = 0, route.reaches_goal, ""
-            return fresh
-        if dead_end and route.entry is not None:
-            self._entries.append(route.entry)
+        if fresh.usable:
+            self._failures, self._to_goal, self.report.message = 0, fresh.reaches_goal, ""
+            return fresh.result
         self._failures += 1
         self._retry_at = self.robot.time + self.config.retry
         self.report.failed_plans += 1
-        self.report.message = (
-            "no way leads nearer to the goal" if dead_end else f"{fresh.status.value}: {fresh.message}"
-        )
-        logger.info("no plan: %s", self.report.message)
+        self.report.message = fresh.reason
+        logger.info("no plan: %s", fresh.reason)
         return None
-
-    def _route(self, goal: Float[ndarray, "2"]) -> Route:
-        assert self.field is not None
-        start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
-        end = torch.as_tensor(goal, dtype=torch.float32)
-        return grid_search(self.body, self.field, start, end, self.config.search, self._closed())
-
-    def _leads_nowhere(self, route: Route, goal: Float[ndarray, "2"]) -> bool:
-        """Whether the robot already stands where the route ends, or would only circle a walled-in goal."""
-        if route.entry is not None:
-            return float((route.path[-1] - route.path[0]).norm()) < 2 * self.config.search.spacing
-        gaps = (route.path - torch.as_tensor(goal, dtype=torch.float32)).norm(dim=1)
-        return float(gaps[0] - gaps[-1]) < self.config.search.spacing
-
-    def _closed(self) -> Float[Tensor, "c 2"] | None:
-        """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
-        if not self._entries:
-            return None
-        entries = torch.stack(self._entries)
-        visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
-        return entries[visits >= self.config.looks]
-
-    def _planned(self, route: Route) -> PlanResult:
-        """CHOMP from the route, or the route itself where CHOMP leaves it.
-
-        The clearance asked for is what the route has, at most the margin; the cost still seeks more.
-        """
-        assert self.field is not None
-        config = self.config
-        path = Trajectory.through(route.path)
-        found = check(self.body, path, self.field, config.chomp.validation)
-        margin = min(config.margin, found.clearance - 0.005)
-        validation = replace(config.chomp.validation, margin=margin)
-        chomp = Chomp(self.body, replace(config.chomp, validation=validation), self.seed)
-        guess = Trajectory.through(route.path, config.num_waypoints) if len(path) > 1 else path
-        result = chomp.optimise(guess, self.field)
-        if not result.success:
-            verdict = check(self.body, path, self.field, validation)
-            result = replace(
-                result,
-                trajectory=path,
-                status=verdict.status,
-                message=f"the searched route: {verdict.message}",
-                clearance=verdict.clearance,
-            )
-        return result
-
-    def _still_good(self) -> bool:
-        """Whether what is left of the plan keeps its clearance on the new map."""
-        if self.plan is None or self.field is None:
-            return False
-        left = self._remaining(self.plan.trajectory)
-        clearance = check(self.body, left, self.field, self.config.chomp.validation).clearance
-        wanted = min(self.config.margin, self.plan.clearance) - self.config.clearance_change
-        return clearance >= wanted
-
-    def _remaining(self, trajectory: Trajectory) -> Trajectory:
-        """The part of a path ahead of the base, starting where the base stands."""
-        here = torch.as_tensor(self.robot.base_state()[:2], dtype=trajectory.waypoints.dtype)
-        nearest = int((trajectory.waypoints - here).norm(dim=1).argmin())
-        ahead = torch.cat([here[None], trajectory.waypoints[nearest + 1 :]])
-        return Trajectory.through(ahead)
 
     def _follow(self, duration: float, final_yaw: float | None) -> None:
         """Let time pass on the plan; without one, turn on the spot to see more."""

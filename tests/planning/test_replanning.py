@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from planning import ChompConfig, ConfigError
+from planning.base_planner import BasePlannerConfig
 from planning.clock import FixedClock, OnlineMap
+from planning.drive import DriveReport, DriveStatus, MobileRobot
 from planning.grid_search import GridSearchConfig
-from planning.replanning import DriveReport, DriveStatus, MobileRobot, ReplanningConfig, ReplanningLoop
+from planning.replanning import ReplanningConfig, ReplanningLoop
 from tests.planning.fields import Box, Cylinder, Sphere, Union, walls_round
 from tests.planning.robots import Disc
 from tests.planning.unicycles import TaughtMap, Unicycle
@@ -22,10 +24,12 @@ FREE = Sphere((0.0, 0.0, 50.0), 0.1)
 PILLAR = Cylinder((1.5, 0.1), 0.3)
 GOAL = np.array([3.0, 0.0])
 QUICK = ReplanningConfig(
+    planner=BasePlannerConfig(
+        search=GridSearchConfig(padding=1.5),
+        chomp=ChompConfig(eps=0.35, max_iterations=60),
+        num_waypoints=20,
+    ),
     scan=0.3,
-    num_waypoints=20,
-    chomp=ChompConfig(eps=0.35, max_iterations=60),
-    search=GridSearchConfig(padding=1.5),
     time_limit=60.0,
     patience=2,
     retry=0.3,
@@ -246,17 +250,22 @@ def test_an_empty_report_is_no_success() -> None:
 @pytest.mark.parametrize(
     "values",
     [
-        {"clearance_change": 0.0},
         {"scan_rate": 0.0},
         {"retry": -1.0},
         {"time_limit": 0.0},
-        {"num_waypoints": 2},
-        {"margin": -0.2},
     ],
 )
 def test_bad_settings_are_refused(values: dict) -> None:
     with pytest.raises(ConfigError, match="ReplanningConfig"):
         ReplanningConfig(**values)
+
+
+@pytest.mark.parametrize(
+    "values", [{"clearance_change": 0.0}, {"num_waypoints": 2}, {"margin": -0.2}, {"looks": 0}]
+)
+def test_bad_planner_settings_are_refused(values: dict) -> None:
+    with pytest.raises(ConfigError, match="BasePlannerConfig"):
+        BasePlannerConfig(**values)
 
 
 def test_what_the_map_only_takes_for_blocked_is_explored_through_the_doorway() -> None:
@@ -269,7 +278,8 @@ def test_what_the_map_only_takes_for_blocked_is_explored_through_the_doorway() -
             seen.append(robot.time)
         return wall if seen else imagined
 
-    config = replace(QUICK, search=replace(QUICK.search, through_blocked=30.0), time_limit=120.0)
+    search = replace(QUICK.planner.search, through_blocked=30.0)
+    config = replace(QUICK, planner=replace(QUICK.planner, search=search), time_limit=120.0)
     _, report = drive(robot, knows, config)
     assert seen and report.success
     assert robot.clearance(BODY, wall) > -0.01

@@ -1,0 +1,158 @@
+"""Plans for a mobile base in a map that is still being learned: search, then CHOMP, and a memory of dead ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from planning.chomp import Chomp, ChompConfig
+from planning.errors import ConfigError
+from planning.grid_search import GridSearchConfig, Route, grid_search
+from planning.protocols import DistanceField, SphereRobot
+from planning.result import PlanResult
+from planning.trajectory import Trajectory
+from planning.validation import check
+
+
+@dataclass(frozen=True)
+class BasePlannerConfig:
+    """How the base plans.
+
+    Args:
+        search: finds the route that CHOMP starts from.
+        chomp: the optimiser; its margin is set by the planner.
+        num_waypoints: of a plan.
+        margin: clearance [m] that plans keep where the map has a route with as much.
+        clearance_change: a plan is no longer good when the map has taken this much [m] of its clearance.
+        looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
+    """
+
+    # A map still being learned is some centimetres wrong, and the robot stands where it stands: hence the negative
+    # least margin.
+    search: GridSearchConfig = field(
+        default_factory=lambda: GridSearchConfig(least_margin=-0.05, through_blocked=30.0)
+    )
+    chomp: ChompConfig = field(default_factory=lambda: ChompConfig(eps=0.35, max_iterations=120))
+    num_waypoints: int = 40
+    margin: float = 0.05
+    clearance_change: float = 0.05
+    looks: int = 3
+
+    def __post_init__(self) -> None:
+        low = self.num_waypoints < 3 or self.looks < 1
+        if low or not self.clearance_change > 0 or not self.margin >= self.search.least_margin:
+            raise ConfigError(
+                "BasePlannerConfig: clearance_change must be positive, num_waypoints at least 3, looks at least 1 and "
+                f"margin at least search.least_margin, got {self}."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class BasePlan:
+    """A plan of the base.
+
+    Args:
+        result: the path with its verdict.
+        reaches_goal: whether it leads to the goal, or only nearer to it.
+        dead_end: whether it leads nowhere, because the robot stands where it ends already.
+    """
+
+    result: PlanResult
+    reaches_goal: bool
+    dead_end: bool
+
+    @property
+    def usable(self) -> bool:
+        """True if it is worth driving."""
+        return self.result.success and not self.dead_end
+
+    @property
+    def reason(self) -> str:
+        """Why it is not."""
+        if self.dead_end:
+            return "no way leads nearer to the goal"
+        return f"{self.result.status.value}: {self.result.message}"
+
+
+class BasePlanner:
+    """Plans to a goal, or as near to it as the map allows.
+
+    Where no free way leads to the goal the plan goes to where the map may be wrong, such as a doorway into a room not
+    seen yet; places that stay blocked when looked at are remembered and not tried again.
+
+    Args:
+        body: the spheres to keep clear, with q = (x, y).
+        config: see `BasePlannerConfig`.
+        seed: of the optimiser's perturbation.
+    """
+
+    def __init__(self, body: SphereRobot, config: BasePlannerConfig | None = None, seed: int = 0) -> None:
+        self.body, self.config, self.seed = body, config or BasePlannerConfig(), seed
+        self._entries: list[Tensor] = []
+
+    def forget(self) -> None:
+        """Forget the dead ends, for another goal."""
+        self._entries = []
+
+    def plan(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField) -> BasePlan:
+        """Plan from start to goal [m]; a dead end is remembered."""
+        route = self.route(start, goal, sdf)
+        result = self._optimised(route, sdf)
+        dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
+        if dead_end and route.entry is not None:
+            self._entries.append(route.entry)
+        return BasePlan(result, route.reaches_goal, dead_end)
+
+    def route(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField) -> Route:
+        """The way that `plan` would start from."""
+        return grid_search(self.body, sdf, start, goal, self.config.search, self._closed())
+
+    def still_good(self, plan: PlanResult, position: Float[Tensor, "2"], sdf: DistanceField) -> bool:
+        """Whether what is left of a plan from where the base stands [m] keeps its clearance on a new map."""
+        waypoints = plan.trajectory.waypoints
+        nearest = int((waypoints - position).norm(dim=1).argmin())
+        left = Trajectory.through(torch.cat([position[None], waypoints[nearest + 1 :]]))
+        clearance = check(self.body, left, sdf, self.config.chomp.validation).clearance
+        return clearance >= min(self.config.margin, plan.clearance) - self.config.clearance_change
+
+    def _optimised(self, route: Route, sdf: DistanceField) -> PlanResult:
+        """CHOMP from the route, or the route itself where CHOMP leaves it.
+
+        The clearance asked for is what the route has, at most the margin; the cost still seeks more.
+        """
+        config = self.config
+        path = Trajectory.through(route.path)
+        found = check(self.body, path, sdf, config.chomp.validation)
+        margin = min(config.margin, found.clearance - 0.005)
+        validation = replace(config.chomp.validation, margin=margin)
+        chomp = Chomp(self.body, replace(config.chomp, validation=validation), self.seed)
+        guess = Trajectory.through(route.path, config.num_waypoints) if len(path) > 1 else path
+        result = chomp.optimise(guess, sdf)
+        if result.success:
+            return result
+        verdict = check(self.body, path, sdf, validation)
+        return replace(
+            result,
+            trajectory=path,
+            status=verdict.status,
+            message=f"the searched route: {verdict.message}",
+            clearance=verdict.clearance,
+        )
+
+    def _leads_nowhere(self, route: Route, goal: Float[Tensor, "2"]) -> bool:
+        """Whether the robot already stands where the route ends, or would only circle a walled-in goal."""
+        if route.entry is not None:
+            return float((route.path[-1] - route.path[0]).norm()) < 2 * self.config.search.spacing
+        gaps = (route.path - goal).norm(dim=1)
+        return float(gaps[0] - gaps[-1]) < self.config.search.spacing
+
+    def _closed(self) -> Float[Tensor, "c 2"] | None:
+        """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
+        if not self._entries:
+            return None
+        entries = torch.stack(self._entries)
+        visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
+        return entries[visits >= self.config.looks]
