@@ -56,17 +56,14 @@ class Film:
 
 
 def save_map_picture(path: Path, episode: Episode, goal: np.ndarray) -> None:
-    """The learned slice beside the true one, each with the driven path; and the room from above."""
-    figure = Figure(figsize=(15, 4), layout="constrained")
-    learned, true, room = figure.subplots(1, 3)
-    image = draw_map(learned, episode, None, goal)
-    learned.set_title(f"learned signed distance at {SLICE_HEIGHT} m")
-    if episode.world.solids:
-        draw_map(true, episode, None, goal, truth=True)
-        true.set_title("ground truth")
-    else:
-        true.set_axis_off()
-    figure.colorbar(image, ax=[learned, true], label="[m]", shrink=0.8)
+    """The learned slice, the true one where it is known, each with the driven path; and the room from above."""
+    truths = (False, True) if episode.world.solids else (False,)
+    figure = Figure(figsize=(5 * len(truths) + 5, 4), layout="constrained")
+    *maps, room = figure.subplots(1, len(truths) + 1)
+    for axes, truth in zip(maps, truths, strict=True):
+        image = draw_map(axes, episode, None, goal, truth=truth)
+        axes.set_title("ground truth" if truth else f"learned signed distance at {SLICE_HEIGHT} m")
+    figure.colorbar(image, ax=maps, label="[m]", shrink=0.8)
     room.imshow(photo(episode, 960, 720))
     room.set_axis_off()
     figure.savefig(path, dpi=110)
