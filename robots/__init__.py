@@ -4,6 +4,14 @@ The pybullet world that stands in for the real one is the subpackage `robots.sim
 imported by name, since it needs a simulator.
 """
 
+from importlib.util import find_spec
+
+if find_spec("pytorch_kinematics") is None:
+    raise ModuleNotFoundError(
+        "robots needs pytorch-kinematics, which is not installed: pip install 'isdf-planning[robots]' for the models, "
+        "or 'isdf-planning[simulation]' for the simulator too"
+    )
+
 from robots.errors import (
     RobotError,
     SceneError,
