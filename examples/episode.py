@@ -48,7 +48,7 @@ class Episode:
 
     def __init__(self, options: EpisodeOptions, start: tuple[float, float, float] | None = None) -> None:
         self.options = options
-        self.scene = _scene(options)
+        self.scene = chosen_scene(options)
         start = start or self.scene.start
         if start is None:
             raise SystemExit(f"{options.scene} has no start of its own: give --start X Y YAW")
@@ -78,7 +78,8 @@ class Episode:
         self.world.close()
 
 
-def _scene(options: EpisodeOptions) -> Scene:
+def chosen_scene(options: EpisodeOptions) -> Scene:
+    """The furnished room or URDF scene that the options name."""
     if options.scene.endswith(".urdf"):
         return load_urdf_scene(options.scene)
     return make_scene(options.scene, options.seed)

@@ -19,12 +19,12 @@ import tyro
 from tqdm import tqdm
 
 from examples.arm import Grasp, execute, grasp_candidates, parked, plan_reach, within_limits
-from examples.episode import Episode, EpisodeOptions
+from examples.episode import Episode, EpisodeOptions, chosen_scene
 from examples.pictures import Film, save_map_picture
 from examples.report import write_report
 from planning.drive import DriveReport
 from planning.replanning import ReplanningConfig, ReplanningLoop
-from robots.simulation import GraspTask
+from robots.simulation import GraspTask, Scene, SceneField
 
 LIFTED, HELD_FOR = 0.10, 2.0
 GRIP_FORCE = 20.0
@@ -49,13 +49,11 @@ class GraspEpisode:
 
     def __init__(self, options: GraspOptions) -> None:
         self.options = options
-        plain = Episode(options)
-        if plain.scene.grasp is None:
+        scene = chosen_scene(options)
+        if scene.grasp is None:
             raise SystemExit(f"{options.scene} has no object to grasp; choose apartment, office or flat")
-        self.task: GraspTask = plain.scene.grasp
-        start = start_before(plain, self.task, options.distance, options.seed)
-        plain.close()
-        self.episode = Episode(options, start)
+        self.task: GraspTask = scene.grasp
+        self.episode = Episode(options, start_before(scene, self.task, options.distance, options.seed))
         self.clock = options.clock()
         self.drive: DriveReport | None = None
         self.planning_seconds = 0.0
@@ -160,11 +158,11 @@ class GraspEpisode:
         self.lift_height = float(min(heights))
 
 
-def start_before(episode: Episode, task: GraspTask, distance: float, seed: int) -> tuple[float, float, float]:
+def start_before(scene: Scene, task: GraspTask, distance: float, seed: int) -> tuple[float, float, float]:
     """A free base pose about `distance` [m] from the parking place, turned any way."""
     rng = np.random.default_rng([seed, 77])
-    field = episode.world.field()
-    width, length, _ = episode.scene.size or (math.inf, math.inf, 0.0)
+    field = SceneField(scene)
+    width, length, _ = scene.size or (math.inf, math.inf, 0.0)
     best, most = task.park, -math.inf
     for _ in range(400):
         angle, reach = rng.uniform(-math.pi, math.pi), rng.uniform(0.8, 1.2) * distance

@@ -16,6 +16,7 @@ from torch import Tensor
 from .bounds import BoundMethod, supervise
 from .cost import CostField
 from .errors import ConfigError, FrameError, NotReadyError
+from .extent import grown, nothing_seen
 from .field import NeuralField
 from .frames import DepthFrame
 from .keyframes import KeyframeConfig, KeyframeSet, explained_share
@@ -131,7 +132,7 @@ class Mapper:
         self._optimiser: torch.optim.AdamW | None = None
         self._newest: DepthFrame | None = None
         self._newest_judged = True
-        self._bounds = torch.tensor([[torch.inf] * 3, [-torch.inf] * 3])
+        self._bounds = nothing_seen()
 
     @property
     def network(self) -> SDFNetwork:
@@ -164,7 +165,7 @@ class Mapper:
             )
         first = self._network is None
         self._judge_newest()
-        self._grow_bounds(frame)
+        self._bounds = grown(self._bounds, frame, reach)
         if first:
             self._begin(frame)
         self._newest, self._newest_judged = frame, first
@@ -277,17 +278,6 @@ class Mapper:
         means = (total / count).tolist()
         for index, loss in zip(keyframes, means[frames - len(keyframes) :], strict=True):
             self.keyframes.record(index, loss)
-
-    def _grow_bounds(self, frame: DepthFrame) -> None:
-        """Extend the observed box by the frame's surfaces (all but the 0.5 % farthest out) and its camera."""
-        stride = max(1, frame.camera.width // 80)
-        points = frame.thinned(stride, self.config.sampling.max_depth).cpu()
-        camera = frame.T_world_camera[None, :3, 3].float().cpu()
-        if len(points):
-            tails = torch.quantile(points, torch.tensor([0.005, 0.995]), dim=0)
-            camera = torch.cat([camera, tails])
-        self._bounds[0] = torch.minimum(self._bounds[0], camera.amin(dim=0))
-        self._bounds[1] = torch.maximum(self._bounds[1], camera.amax(dim=0))
 
 
 def new_optimiser(network: SDFNetwork, config: MapperConfig) -> torch.optim.AdamW:

@@ -16,11 +16,9 @@ from torch import Tensor
 from .. import checkpoint
 from ..cost import CostField
 from ..errors import CheckpointError, ConfigError, IsdfError, NotReadyError
+from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
 from .volume import GrowingVolume
-
-# Share of a frame's points at either end of each axis that does not widen the observed box: outliers of the depth.
-OUTLIERS = 0.005
 
 
 class VoxelMapper(abc.ABC):
@@ -41,7 +39,7 @@ class VoxelMapper(abc.ABC):
         self.config, self.volume = config, volume
         self.frames_seen = 0
         self.steps = 0
-        self._bounds = torch.tensor([[torch.inf] * 3, [-torch.inf] * 3])
+        self._bounds = nothing_seen()
         self._field: Any = None
         self._fresh = True
         self._rebuilt_at = -math.inf
@@ -77,7 +75,7 @@ class VoxelMapper(abc.ABC):
         """
         frame = DepthFrame.of(frame).to(torch.device("cpu"))
         self._fuse(frame)
-        self._grow_bounds(frame)
+        self._bounds = grown(self._bounds, frame, self.config.max_depth)
         self.frames_seen += 1
         self._fresh = False
         # A clock that stands still or jumps back must not stop the rebuilding.
@@ -174,17 +172,6 @@ class VoxelMapper(abc.ABC):
     @abc.abstractmethod
     def config_type(cls) -> type:
         """The class of `config`."""
-
-    def _grow_bounds(self, frame: DepthFrame) -> None:
-        """Extend the observed box by the frame's surfaces (but for outliers) and its camera."""
-        stride = max(1, frame.camera.width // 80)
-        points = frame.thinned(stride, self.config.max_depth).cpu()
-        corners = frame.T_world_camera[None, :3, 3].float().cpu()
-        if len(points):
-            tails = torch.quantile(points, torch.tensor([OUTLIERS, 1 - OUTLIERS]), dim=0)
-            corners = torch.cat([corners, tails])
-        self._bounds[0] = torch.minimum(self._bounds[0], corners.amin(dim=0))
-        self._bounds[1] = torch.maximum(self._bounds[1], corners.amax(dim=0))
 
 
 def check_period(period: float) -> None:
