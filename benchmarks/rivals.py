@@ -85,7 +85,7 @@ def main(options: Rivals) -> None:
 def run(sequence: DepthSequence, config: Config, rate: float) -> tuple[OnlineMapper, RunReport]:
     """Map a sequence live, or without a limit of time when the rate is 0."""
     if rate > 0:
-        return run_at_rate(sequence, config, rate, lambda _: None)
+        return run_at_rate(sequence, config, rate, lambda *_: None)
     mapper, report, before = new_mapper(config), RunReport(), time.process_time()
     for index in range(len(sequence)):
         mapper.integrate(sequence[index])

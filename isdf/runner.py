@@ -1,4 +1,4 @@
-"""Feeding a recorded sequence to a mapper as a live camera would, by one of two clocks."""
+"""Feeding a recorded sequence to a mapper as a live camera would, by one of three clocks."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from dataclasses import dataclass, field, replace
 
 from .datasets import DepthSequence
 from .errors import ConfigError, DatasetError, FrameError
-from .mapper import MapperConfig
+from .mapper import Mapper, MapperConfig
 from .methods import Config, OnlineMapper, new_mapper
 from .voxel import VoxelMapper
 
 logger = logging.getLogger(__name__)
+
+Watch = Callable[[OnlineMapper, int], None]
+"""Called with the mapper and the number of frames that have arrived; what it does costs the mapper no time."""
 
 
 @dataclass
@@ -31,8 +34,30 @@ class RunReport:
     wall_seconds: float = 0.0
 
 
+class _Stopwatch:
+    """CPU and wall seconds spent on mapping, without what the watcher uses."""
+
+    def __init__(self, watch: Watch) -> None:
+        self._watch = watch
+        self._cpu, self._wall = time.process_time(), time.perf_counter()
+
+    @property
+    def cpu(self) -> float:
+        return time.process_time() - self._cpu
+
+    @property
+    def wall(self) -> float:
+        return time.perf_counter() - self._wall
+
+    def watch(self, mapper: OnlineMapper, arrived: int) -> None:
+        cpu, wall = time.process_time(), time.perf_counter()
+        self._watch(mapper, arrived)
+        self._cpu += time.process_time() - cpu
+        self._wall += time.perf_counter() - wall
+
+
 def run_every_frame(
-    sequence: DepthSequence, config: Config, steps_per_frame: int, progress: Callable[[int], None]
+    sequence: DepthSequence, config: Config, steps_per_frame: int, watch: Watch
 ) -> tuple[OnlineMapper, RunReport]:
     """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take.
 
@@ -45,15 +70,40 @@ def run_every_frame(
             config, first_frame_steps=steps_per_frame, steps_per_frame=steps_per_frame, keyframe_steps=0
         )
     mapper, report = new_mapper(config), RunReport()
-    cpu, wall = time.process_time(), time.perf_counter()
+    spent = _Stopwatch(watch)
     for index in range(len(sequence)):
         _integrate(mapper, sequence, index, report)
-        progress(index + 1)
-    return mapper, _finish(report, mapper, sequence, cpu, wall)
+        spent.watch(mapper, index + 1)
+    return mapper, _finish(report, mapper, sequence, spent)
+
+
+def run_at_steps(
+    sequence: DepthSequence, config: MapperConfig, steps_per_second: float, watch: Watch
+) -> tuple[Mapper, RunReport]:
+    """As on a machine that makes so many steps a second, whatever this one makes (the paper's GPU made about 30).
+
+    The sequence's clock advances with the steps: the mapper gets the newest frame, trains on it as long as the
+    configuration says (200 steps on the first frame, 10 on others, 60 more on keyframes in the paper), and frames
+    that arrived meanwhile are dropped.
+    """
+    if not steps_per_second > 0:
+        raise ConfigError(f"steps_per_second must be positive, got {steps_per_second}")
+    if config.steps_per_frame < 1:
+        raise ConfigError("the clock stands still with steps_per_frame = 0; give at least 1")
+    mapper, report = Mapper(config), RunReport()
+    spent = _Stopwatch(watch)
+    index = 0
+    while index < len(sequence):
+        refused = not _integrate(mapper, sequence, index, report)
+        arrived = int(mapper.steps / steps_per_second * sequence.fps)
+        index = index + 1 if refused else max(index + 1, arrived)
+        spent.watch(mapper, min(index, len(sequence)))
+    report.frames_dropped = len(sequence) - report.frames_used - len(report.frames_refused)
+    return mapper, _finish(report, mapper, sequence, spent)
 
 
 def run_at_rate(
-    sequence: DepthSequence, config: Config, cpu_per_second: float, progress: Callable[[int], None]
+    sequence: DepthSequence, config: Config, cpu_per_second: float, watch: Watch
 ) -> tuple[OnlineMapper, RunReport]:
     """Live: at most `cpu_per_second` CPU seconds for each second of sequence.
 
@@ -68,29 +118,29 @@ def run_at_rate(
         live = replace(config, first_frame_steps=0, steps_per_frame=0, keyframe_steps=0)
         frame_steps = config.steps_per_frame
     mapper, report = new_mapper(live), RunReport()
-    cpu, wall = time.process_time(), time.perf_counter()
+    spent = _Stopwatch(watch)
     budget = len(sequence) / sequence.fps * cpu_per_second
     patience, last, waited = frame_steps, -1, 0.0
-    while (used := time.process_time() - cpu + waited) < budget:
+    while (used := spent.cpu + waited) < budget:
         newest = min(int(used / cpu_per_second * sequence.fps), len(sequence) - 1)
         if newest > last and _integrate(mapper, sequence, newest, report):
             patience = frame_steps
         last = newest
-        progress(newest + 1)
+        spent.watch(mapper, newest + 1)
         # Nothing usable yet, or nothing to train: wait for the next frame without burning time.
         if mapper.frames_seen == 0 or isinstance(mapper, VoxelMapper):
             newest_time = (newest + 1) / sequence.fps * cpu_per_second
-            waited += max(0.0, newest_time - (time.process_time() - cpu + waited))
+            waited += max(0.0, newest_time - (spent.cpu + waited))
             continue
         # The paper's rule: a new frame gets its steps before the next one is looked for.
         for _ in range(max(1, patience)):
-            if time.process_time() - cpu + waited >= budget:
+            if spent.cpu + waited >= budget:
                 break
             mapper.step()
         patience = 1
     report.frames_dropped = len(sequence) - report.frames_used - len(report.frames_refused)
-    progress(len(sequence))
-    return mapper, _finish(report, mapper, sequence, cpu, wall)
+    spent.watch(mapper, len(sequence))
+    return mapper, _finish(report, mapper, sequence, spent)
 
 
 def _integrate(mapper: OnlineMapper, sequence: DepthSequence, index: int, report: RunReport) -> bool:
@@ -105,9 +155,7 @@ def _integrate(mapper: OnlineMapper, sequence: DepthSequence, index: int, report
     return True
 
 
-def _finish(
-    report: RunReport, mapper: OnlineMapper, sequence: DepthSequence, cpu: float, wall: float
-) -> RunReport:
+def _finish(report: RunReport, mapper: OnlineMapper, sequence: DepthSequence, spent: _Stopwatch) -> RunReport:
     if mapper.frames_seen == 0:
         raise DatasetError(
             f"{sequence.folder}: none of the {len(sequence)} frames could be used; the first was refused because "
@@ -119,5 +167,5 @@ def _finish(
         report.keyframes = len(mapper.keyframes)
     report.frames, report.steps = len(sequence), mapper.steps
     report.sequence_seconds = len(sequence) / sequence.fps
-    report.cpu_seconds, report.wall_seconds = time.process_time() - cpu, time.perf_counter() - wall
+    report.cpu_seconds, report.wall_seconds = spent.cpu, spent.wall
     return report

@@ -2,6 +2,7 @@
 
 import json
 import os
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from PIL import Image
 from isdf import ConfigError, DatasetError, Mapper, MapperConfig
 from isdf.cli import main
 from isdf.datasets import RecordedSequence, SequenceWriter
-from isdf.runner import run_at_rate, run_every_frame
+from isdf.runner import run_at_rate, run_at_steps, run_every_frame
 from isdf.slices import estimate_up, slice_basis
 from tests.isdf.rooms import furnished_orbit
 
@@ -102,7 +103,7 @@ def test_unusable_frames_are_passed_over_and_reported(sequence_dir) -> None:
     lines = (sequence_dir / "poses.txt").read_text().splitlines()
     lines[6] = " ".join(["5", *["nan"] * 16])
     (sequence_dir / "poses.txt").write_text("\n".join(lines))
-    mapper, report = run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 1, lambda _: None)
+    mapper, report = run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 1, lambda *_: None)
     assert sorted(report.frames_refused) == [0, 3, 5] and report.frames_used == 9 and mapper.frames_seen == 9
     assert "no valid pixel" in report.frames_refused[0] and "NaN" in report.frames_refused[5]
 
@@ -110,27 +111,51 @@ def test_unusable_frames_are_passed_over_and_reported(sequence_dir) -> None:
 def test_a_sequence_without_any_usable_frame_is_an_error(sequence_dir) -> None:
     for index in range(12):
         Image.fromarray(np.zeros((60, 80), np.uint16)).save(sequence_dir / "depth" / f"{index:06d}.png")
-    for run, clock in ((run_every_frame, 1), (run_at_rate, 0.05)):
+    for run, clock in ((run_every_frame, 1), (run_at_rate, 0.05), (run_at_steps, 30.0)):
         with pytest.raises(DatasetError, match="none of the 12 frames"):
-            run(RecordedSequence(sequence_dir), MapperConfig(), clock, lambda _: None)
+            run(RecordedSequence(sequence_dir), MapperConfig(), clock, lambda *_: None)
 
 
 def test_every_frame_gets_its_steps(sequence_dir) -> None:
-    mapper, report = run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 2, lambda _: None)
+    mapper, report = run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 2, lambda *_: None)
     assert mapper.steps == report.steps == 24 and report.frames_used == 12 and report.frames_dropped == 0
     with pytest.raises(ConfigError):
-        run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 0, lambda _: None)
+        run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 0, lambda *_: None)
 
 
 def test_the_live_clock_keeps_to_its_budget_and_drops_frames(sequence_dir) -> None:
     slow = replace(MapperConfig(), steps_per_frame=12)
-    mapper, report = run_at_rate(RecordedSequence(sequence_dir), slow, 0.5, lambda _: None)
+    mapper, report = run_at_rate(RecordedSequence(sequence_dir), slow, 0.5, lambda *_: None)
     assert report.sequence_seconds == pytest.approx(1.2)
     assert 0.6 <= report.cpu_seconds < 1.0  # one step may overrun
     assert report.frames_dropped > 0 and report.frames_used + report.frames_dropped == 12
     assert mapper.steps == report.steps > 0
     with pytest.raises(ConfigError):
-        run_at_rate(RecordedSequence(sequence_dir), slow, 0.0, lambda _: None)
+        run_at_rate(RecordedSequence(sequence_dir), slow, 0.0, lambda *_: None)
+
+
+def test_the_step_clock_shows_the_frames_that_a_faster_machine_would_have_seen(sequence_dir) -> None:
+    config = replace(MapperConfig(), first_frame_steps=6, steps_per_frame=2, keyframe_steps=0)
+    arrived: list[int] = []
+    mapper, report = run_at_steps(
+        RecordedSequence(sequence_dir), config, 10.0, lambda _, n: arrived.append(n)
+    )
+    # 10 frames and 10 steps a second: the first frame takes until frame 6, then every second one is seen.
+    assert arrived == [6, 8, 10, 12] and mapper.steps == report.steps == 12
+    assert report.frames_used == 4 and report.frames_dropped == 8
+    for rate, bad in ((0.0, config), (10.0, replace(config, steps_per_frame=0))):
+        with pytest.raises(ConfigError):
+            run_at_steps(RecordedSequence(sequence_dir), bad, rate, lambda *_: None)
+
+
+def test_watching_costs_the_mapper_no_time(sequence_dir) -> None:
+    def busy(*_: object) -> None:
+        end = time.process_time() + 0.3
+        while time.process_time() < end:
+            pass
+
+    _, report = run_at_rate(RecordedSequence(sequence_dir), MapperConfig(), 0.5, busy)
+    assert 0.6 <= report.cpu_seconds < 1.0
 
 
 def test_map_then_query(sequence_dir, tmp_path, monkeypatch, capsys) -> None:
@@ -155,7 +180,7 @@ def test_map_then_query(sequence_dir, tmp_path, monkeypatch, capsys) -> None:
     ("words", "fault"),
     [
         (("map", "nowhere", "--out", "x"), "not a recorded sequence"),
-        (("map", "nowhere", "--out", "x", "--steps-per-frame", 1, "--cpu-per-second", 1), "not both"),
+        (("map", "nowhere", "--out", "x", "--steps-per-frame", 1, "--cpu-per-second", 1), "give one of"),
         (("query", "nowhere", "--points", "p.npy", "--out", "x.npz"), "no such file"),
     ],
 )

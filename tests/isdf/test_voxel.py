@@ -387,11 +387,11 @@ def test_options_of_another_method_are_refused(sequence_dir, tmp_path, monkeypat
 @every_method
 def test_the_live_clock_waits_for_frames_and_drops_what_it_is_too_slow_for(method, sequence_dir) -> None:
     config, sequence = MAPPERS[method]().config, RecordedSequence(sequence_dir)
-    _, ample = run_at_rate(sequence, config, 20.0, lambda _: None)
+    _, ample = run_at_rate(sequence, config, 20.0, lambda *_: None)
     assert ample.frames_used == 12 and ample.frames_dropped == 0
     # The budget was 24 CPU seconds; waiting is not charged.
     assert ample.cpu_seconds < 6 and ample.sequence_seconds == pytest.approx(1.2)
-    mapper, scarce = run_at_rate(sequence, config, 0.02, lambda _: None)
+    mapper, scarce = run_at_rate(sequence, config, 0.02, lambda *_: None)
     assert 0 < scarce.frames_used < 12 and scarce.frames_used + scarce.frames_dropped == 12
     assert mapper.field() is not None and scarce.steps >= 1
 
