@@ -179,8 +179,11 @@ def _step(
     at_lower = (q[:, moving] <= lower[moving]) & (gradient < 0)
     at_upper = (q[:, moving] >= upper[moving]) & (gradient > 0)
     free = jacobian * ~(at_lower | at_upper)[:, None]
-    normal = free @ free.transpose(-1, -2) + damping[..., None] ** 2 * torch.eye(6).to(q)
-    return (free.transpose(-1, -2) @ torch.linalg.solve(normal, residual[..., None])).squeeze(-1)
+    # In float32 a small damping squared would vanish beside J J^T, and an arm at a singularity has no solution then.
+    wide = free.double()
+    normal = wide @ wide.transpose(-1, -2) + damping[..., None].double() ** 2 * torch.eye(6).to(wide)
+    solved = torch.linalg.solve(normal, residual[..., None].double())
+    return (wide.transpose(-1, -2) @ solved).squeeze(-1).to(q)
 
 
 def _linearise(

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import robots
-from robots.inverse_kinematics import solve
+from robots.inverse_kinematics import _step, solve
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +97,16 @@ def test_bad_requests_are_refused(panda: robots.Robot) -> None:
     no_tool = robots.Robot.from_urdf(panda.urdf_path, panda.sphere_set)
     with pytest.raises(robots.RobotError, match="no tool_link"):
         solve(no_tool, torch.eye(4), no_tool.rest)
+
+
+def test_a_stretched_arm_at_least_damping_still_has_a_step(panda: robots.Robot) -> None:
+    q = torch.zeros(1, 7)
+    jacobian = torch.zeros(1, 6, 7)
+    jacobian[0, :, 0] = torch.tensor([0.3, 0.7, 0.2, 0.5, 0.1, 0.4])  # rank one
+    lower, upper = panda.joint_limits.unbind(-1)
+    step = _step(
+        torch.ones(1, 6), jacobian, q, torch.arange(7), lower - 9, upper + 9, torch.full((1, 1), 1e-4)
+    )
+    assert torch.isfinite(step).all()
+    least_squares = torch.linalg.pinv(jacobian[0].double()) @ torch.ones(6, 1).double()
+    torch.testing.assert_close(step[0].double(), least_squares[:, 0], atol=1e-4, rtol=1e-4)

@@ -35,9 +35,8 @@ def pybullet_poses(robot: robots.Robot, q: torch.Tensor, links: tuple[str, ...])
     client = pybullet.connect(pybullet.DIRECT)
     try:
         body = pybullet.loadURDF(str(robot.urdf_path), useFixedBase=True, physicsClientId=client)
-        infos = [
-            pybullet.getJointInfo(body, i, physicsClientId=client) for i in range(pybullet.getNumJoints(body))
-        ]
+        count = pybullet.getNumJoints(body, physicsClientId=client)
+        infos = [pybullet.getJointInfo(body, i, physicsClientId=client) for i in range(count)]
         joint_index = {info[1].decode(): info[0] for info in infos}
         link_index = {info[12].decode(): info[0] for info in infos}
         for name, value in robot.joint_values(q).items():
