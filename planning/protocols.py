@@ -120,7 +120,7 @@ class FloorRobot(SphereRobot, Protocol):
 
 
 @runtime_checkable
-class CompilableRobot(SphereRobot, Protocol):
+class CompilableRobot(LinkedRobot, Protocol):
     """A robot that lays its kinematics and its exact shape open, so that planning can compile them."""
 
     @property
