@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from planning.protocols import CompilableField, CompilableRobot, CostField, DistanceField, FloorRobot, SphereRobot
+from planning.protocols import CompilableField, CompilableRobot, CostField, DistanceField, SphereRobot
 from planning.workspace import WorkspaceConfig
 
 WIDEST_GAP = 0.05  # [m] between links beyond which nobody asks how far apart they are
@@ -21,14 +21,14 @@ _bodies: WeakKeyDictionary = WeakKeyDictionary()  # robots are immutable, and bu
 class ExactShape:
     """Compiled tests of a robot in a field; make one with `exact_shape`, which tells where it can be had."""
 
-    def __init__(self, robot: CompilableRobot, field: CompilableField) -> None:
+    def __init__(self, robot: CompilableRobot, field: CompilableField, tolerance: float) -> None:
         from planning.compiled.arrays import solids_of
         from planning.compiled.states import World
 
         chain, tree, weights = _body(robot)
         limits = robot.joint_limits.double().clamp(-UNLIMITED, UNLIMITED).numpy()
         self.robot = robot
-        self.world = World(chain, tree, solids_of(field), limits[:, 0], limits[:, 1], weights, 0.0, 0.0)
+        self.world = World(chain, tree, solids_of(field), limits[:, 0], limits[:, 1], weights, 0.0, 0.0, tolerance)
         names = robot.sphere_links
         self._first_sphere = torch.tensor([names.index(name) for name in dict.fromkeys(names)])
 
@@ -57,18 +57,15 @@ class ExactShape:
 def exact_shape(
     robot: SphereRobot, sdf: DistanceField | CostField, config: WorkspaceConfig | None = None
 ) -> ExactShape | None:
-    """The exact shape of a robot in a field, or None where one of them cannot be compiled.
-
-    A robot that stands on the floor cannot, nor can space that counts as blocked for being unknown.
+    """The exact shape of a robot in a field, or None where one of them cannot be compiled, nor can unknown space.
     """
     field = sdf.field if isinstance(sdf, CostField) else sdf
     if not isinstance(robot, CompilableRobot) or not isinstance(field, CompilableField):
         return None
-    if isinstance(robot, FloorRobot) and bool(robot.floor_spheres.any()):
+    config = config or WorkspaceConfig()
+    if config.unknown_confidence is not None:
         return None
-    if config is not None and config.unknown_confidence is not None:
-        return None
-    return ExactShape(robot, field)
+    return ExactShape(robot, field, config.floor_tolerance)
 
 
 def _body(robot: CompilableRobot):  # type: ignore[no-untyped-def]

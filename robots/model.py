@@ -268,6 +268,11 @@ class Robot:
             values.update(zip(self.head_joints, map(float, head), strict=True))
         return self.tree.link_transforms(values)[self.camera_link]
 
+    @property
+    def holdable_joints(self) -> tuple[str, ...]:
+        """Joints that `with_fixed` accepts: all that have a value of their own."""
+        return self.tree.movable_joints
+
     def with_fixed(self, values: Mapping[str, float]) -> Robot:
         """A robot that holds these joints [rad | m] and plans the rest, e.g. the arm of a parked base.
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from planning.protocols import CompilableField, CompilableRobot
+from planning.protocols import CompilableField, CompilableRobot, FloorRobot
 
 LEAVES = 4  # spheres below which a node of the sphere tree is not divided further
 
@@ -38,6 +38,7 @@ class SphereTree(NamedTuple):
     leaf: np.ndarray
     roots: np.ndarray  # first node of each link, and the number of nodes
     pairs: np.ndarray  # of links that must not touch
+    floor: np.ndarray  # whether a link may touch the floor
 
 
 class Solids(NamedTuple):
@@ -78,6 +79,11 @@ def tree_of(robot: CompilableRobot) -> SphereTree:
         roots.append(len(nodes))
         mine = link == number
         _grow(nodes, int(frame[mine][0]), np.asarray(balls[mine], np.float64))
+    links = list(dict.fromkeys(robot.sphere_links))
+    floor = np.zeros(len(links), np.bool_)
+    if isinstance(robot, FloorRobot):
+        standing = zip(robot.sphere_links, robot.floor_spheres.tolist(), strict=True)
+        floor[[links.index(name) for name, on_floor in standing if on_floor]] = True
     frames, centres, radii, skips, leaves = zip(*nodes, strict=True)
     return SphereTree(
         np.array(frames, np.int64),
@@ -87,6 +93,7 @@ def tree_of(robot: CompilableRobot) -> SphereTree:
         np.array(leaves, np.bool_),
         np.array([*roots, len(nodes)], np.int64),
         np.ascontiguousarray(robot.link_pairs, np.int64),
+        floor,
     )
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from planning.compiled.arrays import Solids, SphereTree
+from planning.compiled.arrays import SphereTree
 from planning.compiled.kinematics import poses
-from planning.compiled.solids import grid_sample, solid_distance
+from planning.compiled.solids import FAR, grid_sample, is_floor, solid_distance
 from planning.compiled.states import World, _at, _gap
 
 
@@ -24,7 +24,7 @@ def measure(world: World, states: np.ndarray, order: np.ndarray, floor: float, s
     least, narrowest = np.inf, widest
     for s in order:
         frames = poses(world.chain, states[s])
-        depth[s], link[s] = _clearance(world.tree, world.solids, frames, max(least, floor))
+        depth[s], link[s] = _clearance(world, frames, max(least, floor))
         least = min(least, depth[s])
         gap[s], pair[s, 0], pair[s, 1] = _least_gap(world.tree, frames, min(max(narrowest, self_floor), widest))
         narrowest = min(narrowest, gap[s])
@@ -32,17 +32,21 @@ def measure(world: World, states: np.ndarray, order: np.ndarray, floor: float, s
 
 
 @njit(cache=True)
-def _clearance(tree: SphereTree, solids: Solids, frames: np.ndarray, least: float) -> tuple[float, int]:
+def _clearance(world: World, frames: np.ndarray, least: float) -> tuple[float, int]:
     """Least clearance of any leaf below a bound, else the bound, and the link that has it."""
+    tree, solids, tolerance = world.tree, world.solids, world.floor_tolerance
     where = 0
     for link in range(len(tree.roots) - 1):
         node = tree.roots[link]
         while node < tree.roots[link + 1]:
             x, y, z = _at(frames, tree, node)
+            excused = tree.floor[link] and tree.leaf[node]
             d = grid_sample(solids, x, y, z)[0]
+            if excused and is_floor(solids, -1, d, x, y, z, tolerance):
+                d = FAR
             for i in range(len(solids.kind)):
                 other = solid_distance(solids, i, x, y, z)
-                if not other >= d:
+                if not other >= d and not (excused and is_floor(solids, i, other, x, y, z, tolerance)):
                     d = other
             if np.isnan(d):
                 return np.nan, link

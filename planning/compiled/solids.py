@@ -138,3 +138,15 @@ def distances_and_gradients(solids: Solids, points: np.ndarray) -> tuple[np.ndar
         out[p] = nearest
         gradients[p, 0], gradients[p, 1], gradients[p, 2] = gx, gy, gz
     return out, gradients
+
+
+@njit(cache=True)
+def is_floor(solids: Solids, i: int, d: float, x: float, y: float, z: float, tolerance: float) -> bool:
+    """Whether what is at distance d of a point is the floor z = 0: as far as that, and straight below.
+
+    Solid i, or the grid for i = -1.
+    """
+    if abs(d - z) > tolerance:
+        return False
+    upwards = grid_sample(solids, x, y, z)[3] if i < 0 else solid_gradient(solids, i, x, y, z)[2]
+    return upwards > 0.5

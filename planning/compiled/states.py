@@ -10,14 +10,14 @@ from numba import njit
 
 from planning.compiled.arrays import Chain, Solids, SphereTree
 from planning.compiled.kinematics import poses
-from planning.compiled.solids import grid_sample, solid_distance
+from planning.compiled.solids import grid_sample, is_floor, solid_distance
 
 
 class World(NamedTuple):
     """All that decides whether a configuration is free.
 
     `weights` bound the motion of any sphere per unit of a joint [m]; spheres keep `margin` from solids and
-    `self_margin` from each other [m].
+    `self_margin` from each other [m]; links on the floor are excused from it within `floor_tolerance` [m].
     """
 
     chain: Chain
@@ -28,6 +28,7 @@ class World(NamedTuple):
     weights: np.ndarray
     margin: float
     self_margin: float
+    floor_tolerance: float
 
 
 @njit(cache=True)
@@ -63,13 +64,16 @@ def _link_clear(world: World, frames: np.ndarray, link: int, margin: float) -> b
     while node < end:
         x, y, z = _at(frames, tree, node)
         reach = tree.radius[node] + margin
+        excused = tree.floor[link] and tree.leaf[node]
         clear = True
         for k in range(count):
-            if not solid_distance(solids, near[k], x, y, z) >= reach:
+            d = solid_distance(solids, near[k], x, y, z)
+            if not d >= reach and not (excused and is_floor(solids, near[k], d, x, y, z, world.floor_tolerance)):
                 clear = False
                 break
         if clear and grid:
-            clear = grid_sample(solids, x, y, z)[0] >= reach
+            d = grid_sample(solids, x, y, z)[0]
+            clear = d >= reach or (excused and is_floor(solids, -1, d, x, y, z, world.floor_tolerance))
         if clear:
             node = tree.skip[node]
         elif tree.leaf[node]:
@@ -167,24 +171,3 @@ def first_blocked(world: World, path: np.ndarray, resolution: float) -> int:
             return i
     return -1
 
-
-@njit(cache=True)
-def clearance(world: World, states: np.ndarray, enough: float) -> tuple[float, int]:
-    """Least clearance [m] of any leaf sphere over states (n, dof), `enough` if it is more, and the state."""
-    least, where = enough, 0
-    for s in range(len(states)):
-        frames = poses(world.chain, states[s])
-        node = 0
-        while node < len(world.tree.frame):
-            x, y, z = _at(frames, world.tree, node)
-            bound = least + world.tree.radius[node]
-            d = grid_sample(world.solids, x, y, z)[0]
-            for i in range(len(world.solids.kind)):
-                d = min(d, solid_distance(world.solids, i, x, y, z))
-            if d >= bound:
-                node = world.tree.skip[node]
-                continue
-            if world.tree.leaf[node]:
-                least, where = d - world.tree.radius[node], s
-            node += 1
-    return least, where
