@@ -131,7 +131,7 @@ class Chomp:
             best = run.best_of(descent, guesses, best, late)
             if best.verdict.success or best.verdict.status is Status.INVALID_FIELD or late():
                 break
-            if len(history) >= config.max_iterations:
+            if len(history) >= config.max_iterations or attempt == config.max_tightenings + config.restarts:
                 break
             q = descent.q
             if attempt < config.max_tightenings:

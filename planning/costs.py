@@ -65,17 +65,14 @@ def self_collision_cost(
     Returns:
         The cost [m], its gradient with respect to the centres, and the smallest gap [m] at each waypoint.
     """
-    first, second = pairs[:, 0], pairs[:, 1]
+    from planning.compiled.self_collision import pair_costs
+
     n, s = centres.shape[-3:-1]
-    flat = centres.reshape(-1, s, 3)
-    offset = flat[:, first] - flat[:, second]
-    gap = offset.norm(dim=-1) - (radii[first] + radii[second])
-    state, pair = (gap < eps).nonzero(as_tuple=True)  # few of many: the rest costs nothing
-    cost, slope = hinge_cost(gap[state, pair], eps)
-    direction = torch.nn.functional.normalize(offset[state, pair], dim=-1, eps=1e-9)
-    push = slope.unsqueeze(-1) * direction / n
-    gradient = centres.new_zeros(len(flat) * s, 3)
-    gradient.index_add_(0, state * s + first[pair], push)
-    gradient.index_add_(0, state * s + second[pair], -push)
-    total = centres.new_zeros(len(flat)).index_add_(0, state, cost).view(centres.shape[:-2]).sum(-1) / n
-    return total, gradient.view_as(centres), gap.amin(dim=1).view(centres.shape[:-2])
+    flat = centres.detach().reshape(-1, s, 3).double().numpy()
+    cost, gradient, gap = pair_costs(flat, radii.double().numpy(), pairs.numpy(), eps)
+    batch = centres.shape[:-2]
+    return (
+        torch.from_numpy(cost).to(centres).view(batch).mean(-1),
+        torch.from_numpy(gradient).to(centres).view_as(centres) / n,
+        torch.from_numpy(gap).to(centres).view(batch),
+    )

@@ -13,6 +13,7 @@ from planning.protocols import CompilableField, CompilableRobot, CostField, Dist
 from planning.workspace import WorkspaceConfig
 
 WIDEST_GAP = 0.05  # [m] between links beyond which nobody asks how far apart they are
+LIMIT_TOLERANCE = 1e-5  # [rad | m] taken for rounding, as by the check
 UNLIMITED = 1e3  # stands for the limit of a joint without one [rad | m]
 
 _bodies: WeakKeyDictionary = WeakKeyDictionary()  # robots are immutable, and building their trees takes a while
@@ -28,7 +29,8 @@ class ExactShape:
         chain, tree, weights = _body(robot)
         limits = robot.joint_limits.double().clamp(-UNLIMITED, UNLIMITED).numpy()
         self.robot = robot
-        self.world = World(chain, tree, solids_of(field), limits[:, 0], limits[:, 1], weights, 0.0, 0.0, tolerance)
+        low, high = limits[:, 0] - LIMIT_TOLERANCE, limits[:, 1] + LIMIT_TOLERANCE
+        self.world = World(chain, tree, solids_of(field), low, high, weights, 0.0, 0.0, tolerance)
         names = robot.sphere_links
         self._first_sphere = torch.tensor([names.index(name) for name in dict.fromkeys(names)])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -88,6 +89,12 @@ class PrimitiveField:
             1.0,
         )
 
+    @cached_property
+    def _compiled(self):  # type: ignore[no-untyped-def]
+        from planning.compiled.arrays import solids_of
+
+        return solids_of(self)
+
     def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Signed distances [m] at points [m], differentiable once by autograd."""
         value: Tensor = _Distance.apply(points, self)
@@ -97,11 +104,10 @@ class PrimitiveField:
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Signed distances [m] and their unit gradients at points [m], without an autograd graph."""
-        from planning.compiled.arrays import solids_of
         from planning.compiled.solids import distances_and_gradients
 
         flat = points.detach().reshape(-1, 3).double().numpy()
-        distance, gradient = distances_and_gradients(solids_of(self), flat)
+        distance, gradient = distances_and_gradients(self._compiled, flat)
         return (
             torch.from_numpy(distance).to(points).view(points.shape[:-1]),
             torch.from_numpy(gradient).to(points).view(points.shape),

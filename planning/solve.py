@@ -39,7 +39,7 @@ def _planner() -> PlannerConfig:
     # Goals are a few millimetres from the shelves they stand on, so all margins are small.
     validation = ValidationConfig(max_joint_step=0.01)
     return PlannerConfig(
-        num_waypoints=60,
+        num_waypoints=50,
         chomp=ChompConfig(
             eps=0.03,
             objective=ObjectiveConfig(smoothness_weight=0.1, self_collision_eps=0.01),
@@ -49,7 +49,7 @@ def _planner() -> PlannerConfig:
             max_tightenings=2,
             restarts=0,
         ),
-        rrt=RrtConfig(margin=0.005, reach=0.5, resolution=0.02, shortcut_rounds=200, seconds=5.0, candidates=3),
+        rrt=RrtConfig(margin=0.005, reach=0.5, resolution=0.04, shortcut_rounds=100, seconds=5.0, candidates=3),
     )
 
 

@@ -28,29 +28,25 @@ class SphereTree(NamedTuple):
     """Spheres within spheres, in the order of a walk from the roots, one root a link.
 
     A node is followed by its children; `skip` is the node that comes after all of them. Where a node is clear, all
-    spheres in it are.
+    spheres in it are. Few arrays, since each costs some nanoseconds in every call that passes it.
     """
 
-    frame: np.ndarray
-    centre: np.ndarray
-    radius: np.ndarray
-    skip: np.ndarray
-    leaf: np.ndarray
+    ball: np.ndarray  # (n, 4) centre in its frame, radius
+    walk: np.ndarray  # (n, 3) frame, skip, and 1 for a leaf
     roots: np.ndarray  # first node of each link, and the number of nodes
     pairs: np.ndarray  # of links that must not touch
     floor: np.ndarray  # whether a link may touch the floor
 
 
 class Solids(NamedTuple):
-    """Boxes (kind 0: half sizes), cylinders (1: radius, half height) and balls (2: radius), and a voxel grid.
+    """Solids, one a row of `table`, and a voxel grid, empty where there is none.
 
-    `turn` maps world to solid. The grid is empty, (0, 0, 0), where there is none.
+    A row holds the rotation from world to solid (0-8), the centre (9-11), sizes (12-14), the radius of a ball round the
+    solid (15) and its kind (16): 0 for a box with half sizes, 1 for a cylinder with radius and half height, 2 for a ball.
+    One table instead of an array for each, since passing arrays to small functions costs more than these compute.
     """
 
-    kind: np.ndarray
-    turn: np.ndarray
-    centre: np.ndarray
-    size: np.ndarray
+    table: np.ndarray
     grid: np.ndarray
     low: np.ndarray
     voxel: float
@@ -86,11 +82,8 @@ def tree_of(robot: CompilableRobot) -> SphereTree:
         floor[[links.index(name) for name, on_floor in standing if on_floor]] = True
     frames, centres, radii, skips, leaves = zip(*nodes, strict=True)
     return SphereTree(
-        np.array(frames, np.int64),
-        np.array(centres, np.float64),
-        np.array(radii, np.float64),
-        np.array(skips, np.int64),
-        np.array(leaves, np.bool_),
+        np.c_[np.array(centres, np.float64), np.array(radii, np.float64)],
+        np.ascontiguousarray(np.c_[frames, skips, leaves], np.int64),
         np.array([*roots, len(nodes)], np.int64),
         np.ascontiguousarray(robot.link_pairs, np.int64),
         floor,
@@ -100,11 +93,14 @@ def tree_of(robot: CompilableRobot) -> SphereTree:
 def solids_of(field: CompilableField) -> Solids:
     """A field's solids as contiguous arrays."""
     solids = field.solids
+    n = len(solids.kind)
+    table = np.zeros((n, 17))
+    table[:, 0:9] = np.reshape(solids.turn, (n, 9))
+    table[:, 9:12], table[:, 12:15] = solids.centre, solids.size
+    table[:, 15] = np.linalg.norm(table[:, 12:15], axis=1)  # unused sizes are zero
+    table[:, 16] = solids.kind
     return Solids(
-        np.ascontiguousarray(solids.kind, np.int64),
-        np.ascontiguousarray(solids.turn, np.float64),
-        np.ascontiguousarray(solids.centre, np.float64),
-        np.ascontiguousarray(solids.size, np.float64),
+        table,
         np.ascontiguousarray(solids.grid, np.float32),
         np.ascontiguousarray(solids.low, np.float64),
         float(solids.voxel),
@@ -146,14 +142,15 @@ def joint_weights(
     from planning.compiled.kinematics import place, poses
 
     rng = np.random.default_rng(0)
-    links = tree.roots[:-1]
+    leaves = np.flatnonzero(tree.walk[:, 2])[::10]
+    frame, centre = np.ascontiguousarray(tree.walk[leaves, 0]), np.ascontiguousarray(tree.ball[leaves, :3])
     weights = np.full(len(low), 1e-3)
     for q in rng.uniform(low, high, (200, len(low))):
-        before = place(poses(chain, q), tree.frame[links], tree.centre[links])
+        before = place(poses(chain, q), frame, centre)
         for joint in range(len(q)):
             moved = q.copy()
             moved[joint] += 1e-3
-            turned = place(poses(chain, moved), tree.frame[links], tree.centre[links])
+            turned = place(poses(chain, moved), frame, centre)
             weights[joint] = max(weights[joint], float(np.linalg.norm(turned - before, axis=1).max()) / 1e-3)
     return weights
 

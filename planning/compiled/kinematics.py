@@ -18,33 +18,36 @@ def poses(chain: Chain, q: np.ndarray) -> np.ndarray:
     local = np.empty((3, 4))
     for j in range(len(chain.parent)):
         value = chain.multiplier[j] * q[chain.column[j]] + chain.offset[j]
-        _moved(chain.origin[j], chain.axis[j], value, chain.prismatic[j], local)
-        above = out[chain.parent[j]]
-        pose = out[j + 1]
+        _moved(chain, j, value, local)
+        p = chain.parent[j]
         for r in range(3):
             for c in range(4):
-                pose[r, c] = above[r, 0] * local[0, c] + above[r, 1] * local[1, c] + above[r, 2] * local[2, c]
-            pose[r, 3] += above[r, 3]
+                out[j + 1, r, c] = (
+                    out[p, r, 0] * local[0, c] + out[p, r, 1] * local[1, c] + out[p, r, 2] * local[2, c]
+                )
+            out[j + 1, r, 3] += out[p, r, 3]
     return out
 
 
-@njit(cache=True, inline="never")
-def _moved(origin: np.ndarray, axis: np.ndarray, value: float, prismatic: bool, out: np.ndarray) -> None:
-    """Origin followed by the joint's motion: a slide, or a turn by Rodrigues' formula."""
-    x, y, z = axis
-    if prismatic:
-        out[:] = origin
+@njit(cache=True)
+def _moved(chain: Chain, j: int, value: float, out: np.ndarray) -> None:
+    """A joint's origin followed by its motion: a slide, or a turn by Rodrigues' formula."""
+    origin = chain.origin
+    x, y, z = chain.axis[j, 0], chain.axis[j, 1], chain.axis[j, 2]
+    if chain.prismatic[j]:
         for r in range(3):
-            out[r, 3] += value * (origin[r, 0] * x + origin[r, 1] * y + origin[r, 2] * z)
+            for c in range(4):
+                out[r, c] = origin[j, r, c]
+            out[r, 3] += value * (origin[j, r, 0] * x + origin[j, r, 1] * y + origin[j, r, 2] * z)
         return
     s, c = math.sin(value), math.cos(value)
     t = 1.0 - c
     for r in range(3):
-        a, b, d = origin[r, 0], origin[r, 1], origin[r, 2]
+        a, b, d = origin[j, r, 0], origin[j, r, 1], origin[j, r, 2]
         out[r, 0] = a * (t * x * x + c) + b * (t * x * y + s * z) + d * (t * x * z - s * y)
         out[r, 1] = a * (t * x * y - s * z) + b * (t * y * y + c) + d * (t * y * z + s * x)
         out[r, 2] = a * (t * x * z + s * y) + b * (t * y * z - s * x) + d * (t * z * z + c)
-        out[r, 3] = origin[r, 3]
+        out[r, 3] = origin[j, r, 3]
 
 
 @njit(cache=True)

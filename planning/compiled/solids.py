@@ -10,72 +10,83 @@ from numba import njit
 from planning.compiled.arrays import Solids
 
 FAR = 1e9
+FLOOR_SLOPE = 0.5  # least upward component of the gradient above a floor
 
 
 @njit(cache=True)
-def solid_distance(solids: Solids, i: int, x: float, y: float, z: float) -> float:
+def solid_distance(table: np.ndarray, i: int, x: float, y: float, z: float) -> float:
     """Signed distance [m] of a point to solid i."""
-    turn, centre, size = solids.turn[i], solids.centre[i], solids.size[i]
-    dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
-    kind = solids.kind[i]
-    if kind == 2:
-        return math.sqrt(dx * dx + dy * dy + dz * dz) - size[0]
-    a = turn[0, 0] * dx + turn[0, 1] * dy + turn[0, 2] * dz
-    b = turn[1, 0] * dx + turn[1, 1] * dy + turn[1, 2] * dz
-    c = turn[2, 0] * dx + turn[2, 1] * dy + turn[2, 2] * dz
-    if kind == 1:
-        a = math.sqrt(a * a + b * b) - size[0]
-        c = abs(c) - size[1]
+    dx, dy, dz = x - table[i, 9], y - table[i, 10], z - table[i, 11]
+    kind = table[i, 16]
+    if kind == 2.0:
+        return math.sqrt(dx * dx + dy * dy + dz * dz) - table[i, 12]
+    a = table[i, 0] * dx + table[i, 1] * dy + table[i, 2] * dz
+    b = table[i, 3] * dx + table[i, 4] * dy + table[i, 5] * dz
+    c = table[i, 6] * dx + table[i, 7] * dy + table[i, 8] * dz
+    if kind == 1.0:
+        a = math.sqrt(a * a + b * b) - table[i, 12]
+        b = -1.0
+        c = abs(c) - table[i, 13]
         inside = min(max(a, c), 0.0)
-        a, c = max(a, 0.0), max(c, 0.0)
-        return math.sqrt(a * a + c * c) + inside
-    a, b, c = abs(a) - size[0], abs(b) - size[1], abs(c) - size[2]
-    inside = min(max(a, b, c), 0.0)
+    else:
+        a, b, c = abs(a) - table[i, 12], abs(b) - table[i, 13], abs(c) - table[i, 14]
+        inside = min(max(a, b, c), 0.0)
     a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
     return math.sqrt(a * a + b * b + c * c) + inside
 
 
 @njit(cache=True)
-def solid_gradient(solids: Solids, i: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+def beyond(table: np.ndarray, i: int, x: float, y: float, z: float, reach: float) -> bool:
+    """Whether a point is further than `reach` from solid i for sure, by the ball round it."""
+    dx, dy, dz = x - table[i, 9], y - table[i, 10], z - table[i, 11]
+    far = reach + table[i, 15]
+    return dx * dx + dy * dy + dz * dz >= far * far
+
+
+@njit(cache=True)
+def solid_gradient(table: np.ndarray, i: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Unit gradient of `solid_distance`; a fixed direction where there are several."""
-    turn, centre, size = solids.turn[i], solids.centre[i], solids.size[i]
-    dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
-    kind = solids.kind[i]
-    if kind == 2:
+    dx, dy, dz = x - table[i, 9], y - table[i, 10], z - table[i, 11]
+    kind = table[i, 16]
+    if kind == 2.0:
         norm = math.sqrt(dx * dx + dy * dy + dz * dz)
         return (dx / norm, dy / norm, dz / norm) if norm > 0.0 else (1.0, 0.0, 0.0)
-    a = turn[0, 0] * dx + turn[0, 1] * dy + turn[0, 2] * dz
-    b = turn[1, 0] * dx + turn[1, 1] * dy + turn[1, 2] * dz
-    c = turn[2, 0] * dx + turn[2, 1] * dy + turn[2, 2] * dz
-    sign_a, sign_b, sign_c = math.copysign(1.0, a), math.copysign(1.0, b), math.copysign(1.0, c)
-    if kind == 1:
-        radial = math.sqrt(a * a + b * b)
-        u, v = (a / radial, b / radial) if radial > 0.0 else (1.0, 0.0)
-        r, h = radial - size[0], abs(c) - size[1]
-        if r > 0.0 and h > 0.0:
-            norm = math.sqrt(r * r + h * h)
-            ga, gb, gc = u * r / norm, v * r / norm, sign_c * h / norm
-        elif r >= h:
-            ga, gb, gc = u, v, 0.0
-        else:
-            ga, gb, gc = 0.0, 0.0, sign_c
+    a = table[i, 0] * dx + table[i, 1] * dy + table[i, 2] * dz
+    b = table[i, 3] * dx + table[i, 4] * dy + table[i, 5] * dz
+    c = table[i, 6] * dx + table[i, 7] * dy + table[i, 8] * dz
+    if kind == 1.0:
+        ga, gb, gc = _cylinder_gradient(a, b, c, table[i, 12], table[i, 13])
     else:
-        a, b, c = abs(a) - size[0], abs(b) - size[1], abs(c) - size[2]
-        pa, pb, pc = max(a, 0.0), max(b, 0.0), max(c, 0.0)
-        norm = math.sqrt(pa * pa + pb * pb + pc * pc)
-        if norm > 0.0:
-            ga, gb, gc = sign_a * pa / norm, sign_b * pb / norm, sign_c * pc / norm
-        elif a >= b and a >= c:
-            ga, gb, gc = sign_a, 0.0, 0.0
-        elif b >= c:
-            ga, gb, gc = 0.0, sign_b, 0.0
-        else:
-            ga, gb, gc = 0.0, 0.0, sign_c
+        ga, gb, gc = _box_gradient(a, b, c, table[i, 12], table[i, 13], table[i, 14])
     return (
-        turn[0, 0] * ga + turn[1, 0] * gb + turn[2, 0] * gc,
-        turn[0, 1] * ga + turn[1, 1] * gb + turn[2, 1] * gc,
-        turn[0, 2] * ga + turn[1, 2] * gb + turn[2, 2] * gc,
+        table[i, 0] * ga + table[i, 3] * gb + table[i, 6] * gc,
+        table[i, 1] * ga + table[i, 4] * gb + table[i, 7] * gc,
+        table[i, 2] * ga + table[i, 5] * gb + table[i, 8] * gc,
     )
+
+
+@njit(cache=True)
+def _cylinder_gradient(a: float, b: float, c: float, radius: float, half: float) -> tuple[float, float, float]:
+    up = math.copysign(1.0, c)
+    radial = math.sqrt(a * a + b * b)
+    u, v = (a / radial, b / radial) if radial > 0.0 else (1.0, 0.0)
+    r, h = radial - radius, abs(c) - half
+    if r > 0.0 and h > 0.0:
+        norm = math.sqrt(r * r + h * h)
+        return u * r / norm, v * r / norm, up * h / norm
+    return (u, v, 0.0) if r >= h else (0.0, 0.0, up)
+
+
+@njit(cache=True)
+def _box_gradient(a: float, b: float, c: float, sa: float, sb: float, sc: float) -> tuple[float, float, float]:
+    da, db, dc = abs(a) - sa, abs(b) - sb, abs(c) - sc
+    pa, pb, pc = max(da, 0.0), max(db, 0.0), max(dc, 0.0)
+    norm = math.sqrt(pa * pa + pb * pb + pc * pc)
+    if norm > 0.0:
+        return math.copysign(pa / norm, a), math.copysign(pb / norm, b), math.copysign(pc / norm, c)
+    if da >= db and da >= dc:
+        return math.copysign(1.0, a), 0.0, 0.0
+    return (0.0, math.copysign(1.0, b), 0.0) if db >= dc else (0.0, 0.0, math.copysign(1.0, c))
 
 
 @njit(cache=True)
@@ -112,8 +123,8 @@ def distances(solids: Solids, points: np.ndarray) -> np.ndarray:
     for p in range(len(points)):
         x, y, z = points[p]
         nearest = grid_sample(solids, x, y, z)[0]
-        for i in range(len(solids.kind)):
-            d = solid_distance(solids, i, x, y, z)
+        for i in range(len(solids.table)):
+            d = solid_distance(solids.table, i, x, y, z)
             if not d >= nearest:
                 nearest = d
         out[p] = nearest
@@ -129,24 +140,19 @@ def distances_and_gradients(solids: Solids, points: np.ndarray) -> tuple[np.ndar
         x, y, z = points[p]
         nearest, gx, gy, gz = grid_sample(solids, x, y, z)
         winner = -1
-        for i in range(len(solids.kind)):
-            d = solid_distance(solids, i, x, y, z)
-            if not d >= nearest:
-                nearest, winner = d, i
+        for i in range(len(solids.table)):
+            if not beyond(solids.table, i, x, y, z, max(nearest, 0.0)):
+                d = solid_distance(solids.table, i, x, y, z)
+                if not d >= nearest:
+                    nearest, winner = d, i
         if winner >= 0:
-            gx, gy, gz = solid_gradient(solids, winner, x, y, z)
+            gx, gy, gz = solid_gradient(solids.table, winner, x, y, z)
         out[p] = nearest
         gradients[p, 0], gradients[p, 1], gradients[p, 2] = gx, gy, gz
     return out, gradients
 
 
 @njit(cache=True)
-def is_floor(solids: Solids, i: int, d: float, x: float, y: float, z: float, tolerance: float) -> bool:
-    """Whether what is at distance d of a point is the floor z = 0: as far as that, and straight below.
-
-    Solid i, or the grid for i = -1.
-    """
-    if abs(d - z) > tolerance:
-        return False
-    upwards = grid_sample(solids, x, y, z)[3] if i < 0 else solid_gradient(solids, i, x, y, z)[2]
-    return upwards > 0.5
+def solid_is_floor(table: np.ndarray, i: int, d: float, x: float, y: float, z: float, tolerance: float) -> bool:
+    """Whether solid i at distance d of a point is the floor z = 0: as far off as that, and straight below."""
+    return abs(d - z) <= tolerance and solid_gradient(table, i, x, y, z)[2] > FLOOR_SLOPE

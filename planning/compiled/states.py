@@ -10,7 +10,7 @@ from numba import njit
 
 from planning.compiled.arrays import Chain, Solids, SphereTree
 from planning.compiled.kinematics import poses
-from planning.compiled.solids import grid_sample, is_floor, solid_distance
+from planning.compiled.solids import FLOOR_SLOPE, beyond, grid_sample, solid_distance, solid_is_floor
 
 
 class World(NamedTuple):
@@ -33,101 +33,127 @@ class World(NamedTuple):
 
 @njit(cache=True)
 def free(world: World, q: np.ndarray) -> bool:
-    """Whether a configuration keeps its limits and margins."""
+    """Whether a configuration keeps its limits and margins; links that no joint moves are not looked at."""
     for j in range(len(q)):
         if not (world.low[j] <= q[j] <= world.high[j]):
             return False
     frames = poses(world.chain, q)
-    for link in range(len(world.tree.roots) - 1):
-        if not _link_clear(world, frames, link, world.margin):
-            return False
-    return _links_apart(world, frames)
-
-
-@njit(cache=True)
-def _link_clear(world: World, frames: np.ndarray, link: int, margin: float) -> bool:
-    """Whether all spheres of a link keep the margin; only solids near the whole link are looked at twice."""
     tree, solids = world.tree, world.solids
-    root, end = tree.roots[link], tree.roots[link + 1]
-    near = np.empty(len(solids.kind), np.int64)
-    count = 0
-    x, y, z = _at(frames, tree, root)
-    reach = tree.radius[root] + margin
-    for i in range(len(solids.kind)):
-        if not solid_distance(solids, i, x, y, z) >= reach:
-            near[count] = i
-            count += 1
-    grid = not grid_sample(solids, x, y, z)[0] >= reach
-    if count == 0 and not grid:
-        return True
-    node = root
-    while node < end:
-        x, y, z = _at(frames, tree, node)
-        reach = tree.radius[node] + margin
-        excused = tree.floor[link] and tree.leaf[node]
-        clear = True
-        for k in range(count):
-            d = solid_distance(solids, near[k], x, y, z)
-            if not d >= reach and not (excused and is_floor(solids, near[k], d, x, y, z, world.floor_tolerance)):
-                clear = False
-                break
-        if clear and grid:
-            d = grid_sample(solids, x, y, z)[0]
-            clear = d >= reach or (excused and is_floor(solids, -1, d, x, y, z, world.floor_tolerance))
-        if clear:
-            node = tree.skip[node]
-        elif tree.leaf[node]:
-            return False
-        else:
-            node += 1
-    return True
+    if not _clear_of_solids(tree.ball, tree.walk, tree.roots, tree.floor, solids.table, frames, world.margin, world.floor_tolerance):
+        return False
+    if len(solids.grid) > 0 and not _clear_of_grid(tree, solids, frames, world.margin, world.floor_tolerance):
+        return False
+    return _links_apart(tree.ball, tree.walk, tree.roots, tree.pairs, frames, world.self_margin)
 
 
 @njit(cache=True)
-def _links_apart(world: World, frames: np.ndarray) -> bool:
-    """Whether no two links that may not touch do."""
-    tree = world.tree
-    for p in range(len(tree.pairs)):
-        a, b = tree.pairs[p]
-        if not _apart(tree, frames, tree.roots[a], tree.roots[a + 1], tree.roots[b], tree.roots[b + 1], world.self_margin):
-            return False
-    return True
-
-
-@njit(cache=True)
-def _apart(tree: SphereTree, frames: np.ndarray, a: int, a_end: int, b: int, b_end: int, margin: float) -> bool:
-    bx, by, bz = _at(frames, tree, b)
-    while a < a_end:
-        ax, ay, az = _at(frames, tree, a)
-        if _gap(ax, ay, az, bx, by, bz) - tree.radius[a] - tree.radius[b] >= margin:
-            a = tree.skip[a]
+def _clear_of_solids(
+    ball: np.ndarray,
+    walk: np.ndarray,
+    roots: np.ndarray,
+    floor: np.ndarray,
+    table: np.ndarray,
+    frames: np.ndarray,
+    margin: float,
+    tolerance: float,
+) -> bool:
+    """Whether all spheres keep the margin from all solids; only solids near a whole link are looked at twice."""
+    near = np.empty(len(table), np.int64)
+    for link in range(len(roots) - 1):
+        node, end = roots[link], roots[link + 1]
+        if walk[node, 0] == 0:
             continue
-        if tree.leaf[a]:
-            node = b
-            while node < b_end:
-                x, y, z = _at(frames, tree, node)
-                if _gap(ax, ay, az, x, y, z) - tree.radius[a] - tree.radius[node] >= margin:
-                    node = tree.skip[node]
-                elif tree.leaf[node]:
-                    return False
-                else:
-                    node += 1
-        a += 1
+        x, y, z = at(frames, ball, walk, node)
+        reach = ball[node, 3] + margin
+        count = 0
+        for i in range(len(table)):
+            if not beyond(table, i, x, y, z, reach) and not solid_distance(table, i, x, y, z) >= reach:
+                near[count] = i
+                count += 1
+        if count == 0:
+            continue
+        while node < end:
+            x, y, z = at(frames, ball, walk, node)
+            reach = ball[node, 3] + margin
+            clear = True
+            for k in range(count):
+                d = solid_distance(table, near[k], x, y, z)
+                if not d >= reach:
+                    excused = floor[link] and walk[node, 2] == 1
+                    if not (excused and solid_is_floor(table, near[k], d, x, y, z, tolerance)):
+                        clear = False
+                        break
+            if clear:
+                node = walk[node, 1]
+            elif walk[node, 2] == 1:
+                return False
+            else:
+                node += 1
     return True
 
 
 @njit(cache=True)
-def _at(frames: np.ndarray, tree: SphereTree, node: int) -> tuple[float, float, float]:
-    pose, c = frames[tree.frame[node]], tree.centre[node]
+def _clear_of_grid(tree: SphereTree, solids: Solids, frames: np.ndarray, margin: float, tolerance: float) -> bool:
+    """Whether all spheres keep the margin from what the grid holds."""
+    for link in range(len(tree.roots) - 1):
+        node, end = tree.roots[link], tree.roots[link + 1]
+        while node < end and tree.walk[node, 0] > 0:
+            x, y, z = at(frames, tree.ball, tree.walk, node)
+            d, _, _, up = grid_sample(solids, x, y, z)
+            leaf = tree.walk[node, 2] == 1
+            floor = leaf and tree.floor[link] and abs(d - z) <= tolerance and up > FLOOR_SLOPE
+            if d >= tree.ball[node, 3] + margin or floor:
+                node = tree.walk[node, 1]
+            elif leaf:
+                return False
+            else:
+                node += 1
+    return True
+
+
+@njit(cache=True)
+def _links_apart(
+    ball: np.ndarray, walk: np.ndarray, roots: np.ndarray, pairs: np.ndarray, frames: np.ndarray, margin: float
+) -> bool:
+    """Whether no two links that may not touch do."""
+    for p in range(len(pairs)):
+        a, a_end = roots[pairs[p, 0]], roots[pairs[p, 0] + 1]
+        root, end = roots[pairs[p, 1]], roots[pairs[p, 1] + 1]
+        bx, by, bz = at(frames, ball, walk, root)
+        while a < a_end:
+            ax, ay, az = at(frames, ball, walk, a)
+            if gap(ax, ay, az, bx, by, bz) >= ball[a, 3] + ball[root, 3] + margin:
+                a = walk[a, 1]
+                continue
+            if walk[a, 2] == 1:
+                b = root
+                while b < end:
+                    x, y, z = at(frames, ball, walk, b)
+                    if gap(ax, ay, az, x, y, z) >= ball[a, 3] + ball[b, 3] + margin:
+                        b = walk[b, 1]
+                    elif walk[b, 2] == 1:
+                        return False
+                    else:
+                        b += 1
+            a += 1
+    return True
+
+
+@njit(cache=True)
+def at(frames: np.ndarray, ball: np.ndarray, walk: np.ndarray, node: int) -> tuple[float, float, float]:
+    """World position of a node's centre [m]."""
+    f = walk[node, 0]
+    a, b, c = ball[node, 0], ball[node, 1], ball[node, 2]
     return (
-        pose[0, 0] * c[0] + pose[0, 1] * c[1] + pose[0, 2] * c[2] + pose[0, 3],
-        pose[1, 0] * c[0] + pose[1, 1] * c[1] + pose[1, 2] * c[2] + pose[1, 3],
-        pose[2, 0] * c[0] + pose[2, 1] * c[1] + pose[2, 2] * c[2] + pose[2, 3],
+        frames[f, 0, 0] * a + frames[f, 0, 1] * b + frames[f, 0, 2] * c + frames[f, 0, 3],
+        frames[f, 1, 0] * a + frames[f, 1, 1] * b + frames[f, 1, 2] * c + frames[f, 1, 3],
+        frames[f, 2, 0] * a + frames[f, 2, 1] * b + frames[f, 2, 2] * c + frames[f, 2, 3],
     )
 
 
 @njit(cache=True)
-def _gap(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
+def gap(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
+    """Distance of two points [m]."""
     return math.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
 
 
