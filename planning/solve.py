@@ -37,7 +37,8 @@ class PosableRobot(SphereRobot, Protocol):
 
 def _planner() -> PlannerConfig:
     # Goals are a few millimetres from the shelves they stand on, so all margins are small.
-    validation = ValidationConfig(max_joint_step=0.01)
+    # The fine cover protrudes by 1.5 mm, so half a millimetre within it is still clear of the robot itself.
+    validation = ValidationConfig(max_joint_step=0.01, margin=-0.0005)
     return PlannerConfig(
         num_waypoints=50,
         chomp=ChompConfig(
@@ -49,7 +50,7 @@ def _planner() -> PlannerConfig:
             max_tightenings=2,
             restarts=0,
         ),
-        rrt=RrtConfig(margin=0.005, reach=0.5, resolution=0.04, shortcut_rounds=100, seconds=5.0, candidates=3),
+        rrt=RrtConfig(margin=0.005, reach=0.5, resolution=0.04, shortcut_rounds=150, seconds=5.0, candidates=6),
     )
 
 
