@@ -31,7 +31,8 @@ if not __package__:  # run as a file
 
 from benchmarks.experiments import EXPERIMENTS, REAL, REGION_OF, Experiment, Job
 from benchmarks.runs import REAL_FPS, Study, prepare, run, write_json
-from isdf.errors import IsdfError
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -97,11 +98,15 @@ def _jobs(study: Study, options: Options, name: Experiment) -> list[Job]:
         if study.data is None:
             raise SystemExit("the real sequences are not here: give --data or set ISDF_DATA_DIR")
         folder, mark, advice = study.data, "poses.txt", "give --data the folder that has them"
-    there = sorted(p.parent.name for p in folder.glob(f"*/{mark}") if name != REAL or p.parent.name in REAL_FPS)
+    there = sorted(
+        p.parent.name for p in folder.glob(f"*/{mark}") if name != REAL or p.parent.name in REAL_FPS
+    )
     names = list(options.only) or there
     if not names or set(names) - set(there):
         lacking = ", ".join(sorted(set(names) - set(there))) or "any"
-        raise SystemExit(f"{folder}: no sequence {lacking} with a {mark}, only {', '.join(there) or 'none'}; {advice}")
+        raise SystemExit(
+            f"{folder}: no sequence {lacking} with a {mark}, only {', '.join(there) or 'none'}; {advice}"
+        )
     jobs = EXPERIMENTS[name](names, options.seeds)
     labels = sorted({job.method for job in jobs})
     jobs = [job for job in jobs if not options.methods or job.method in options.methods]
@@ -137,8 +142,9 @@ def _in_parallel(
 def _attempt(work: Callable[..., Any], study: Study, task: Any) -> str | None:
     try:
         work(study, task)
-    except (IsdfError, OSError) as error:
-        return f"{getattr(task, 'key', task)}: {error}"
+    except Exception as error:
+        logger.debug("failed", exc_info=True)
+        return f"{getattr(task, 'key', task)}: {type(error).__name__}: {error}"
     return None
 
 

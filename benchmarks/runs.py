@@ -170,7 +170,10 @@ def _judge(study: Study, job: Job, index: int, moment: float, steps: int, shown:
     unmapped = None if isinstance(job.config, MapperConfig) else shown.confidence(truth.points) == 0
     region = _region(study, job, index, truth, unmapped)
     own = evaluate(shown, truth, "own").gradient_distance
-    found: dict[str, Any] = {"visible": evaluate(shown, truth, unmapped=unmapped).as_json(), "own_gradient": own}
+    found: dict[str, Any] = {
+        "visible": evaluate(shown, truth, unmapped=unmapped).as_json(),
+        "own_gradient": own,
+    }
     if region is not None:
         inside = None if unmapped is None else unmapped[region]
         found["voxblox_region"] = evaluate(shown, truth.where(region), unmapped=inside).as_json()
@@ -198,7 +201,9 @@ def _record(study: Study, job: Job, mapper: OnlineMapper, report: RunReport) -> 
     file.parent.mkdir(parents=True, exist_ok=True)
     mapper.save(file)
     bounds = mapper.bounds
-    points = bounds[0] + torch.rand(50_000, 3, generator=torch.Generator().manual_seed(0)) * (bounds[1] - bounds[0])
+    points = bounds[0] + torch.rand(50_000, 3, generator=torch.Generator().manual_seed(0)) * (
+        bounds[1] - bounds[0]
+    )
     return _identity(job) | {
         "report": dataclasses.asdict(report),
         "cpu_per_second": report.cpu_seconds / report.sequence_seconds,

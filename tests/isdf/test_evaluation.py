@@ -47,7 +47,11 @@ BOX = torch.tensor([[-2.5, -2.0, 0.0], [2.5, 2.0, 2.5]])
 
 @pytest.fixture(scope="module")
 def truth() -> Truth:
-    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * (BOX[1] - BOX[0] + 0.2) + BOX[0] - 0.1
+    points = (
+        torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * (BOX[1] - BOX[0] + 0.2)
+        + BOX[0]
+        - 0.1
+    )
     return Truth.of(Analytic(ROOM), points)
 
 
@@ -126,7 +130,9 @@ def test_answers_that_are_no_numbers_are_refused(truth, bad, gradient) -> None:
 
 def test_a_truth_with_nan_is_refused(truth) -> None:
     with pytest.raises(EvaluationError, match="distance"):
-        dataclasses.replace(truth, distance=truth.distance.clone().index_fill_(0, torch.tensor([3]), math.nan))
+        dataclasses.replace(
+            truth, distance=truth.distance.clone().index_fill_(0, torch.tensor([3]), math.nan)
+        )
 
 
 def test_roc_area_rewards_doubt_where_errors_are() -> None:
