@@ -139,7 +139,10 @@ BACKENDS = [
     pytest.param(
         "dask",
         2,
-        marks=pytest.mark.skipif(not importlib.util.find_spec("distributed"), reason="needs `distributed`"),
+        marks=[
+            pytest.mark.slow,
+            pytest.mark.skipif(not importlib.util.find_spec("distributed"), reason="needs `distributed`"),
+        ],
     ),
 ]
 
@@ -193,7 +196,9 @@ def test_a_map_that_fails_is_named_and_the_others_go_on(recorded, tmp_path, monk
 
 def test_held_out_frames_judge_a_map_of_the_others(study) -> None:
     values = json.loads(
-        run(study, job(experiment="real", method="exact", config=ExactConfig(voxel=0.08), clock=Clock())).read_text()
+        run(
+            study, job(experiment="real", method="exact", config=ExactConfig(voxel=0.08), clock=Clock())
+        ).read_text()
     )
     assert values["held_out"]["rays"] == 40 and values["report"]["frames"] == 14
     assert values["held_out"]["median_error"] < 0.05 and values["held_out"]["blocked"] < 0.02
