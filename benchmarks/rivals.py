@@ -1,4 +1,4 @@
-"""The neural field against the voxel maps on one recorded sequence of a scene whose exact distances are known.
+"""The neural field against voxel maps on one recorded sequence of a scene whose exact distances are known.
 
     python -m examples.record --out runs/recorded --scene office --seed 5
     python -m benchmarks.rivals runs/recorded --scene office --seed 5
