@@ -1,4 +1,4 @@
-"""The neural field against the voxel maps on one recorded sequence of a scene whose exact distances are known.
+"""The neural field against voxel maps on one recorded sequence of a scene whose exact distances are known.
 
     python -m examples.record --out runs/recorded --scene office --seed 5
     python -m benchmarks.rivals runs/recorded --scene office --seed 5
@@ -28,7 +28,7 @@ from isdf.datasets import DepthSequence, open_sequence
 from isdf.errors import DatasetError, FrameError
 from isdf.methods import Config, OnlineMapper, new_mapper
 from isdf.runner import RunReport, run_at_rate
-from isdf.voxel import ExactConfig, KinectFusionConfig, VoxelMapper
+from isdf.voxel import ExactConfig, FiestaConfig, KinectFusionConfig, VoxbloxConfig, VoxelMapper
 from robots.simulation import SceneField, make_scene
 
 # Pixels measured farther than this [m] are no evaluation points: no method maps them.
@@ -37,6 +37,9 @@ NEAREST = 0.1
 METHODS: dict[str, Config] = {
     "isdf": MapperConfig(),
     "exact": ExactConfig(),
+    "voxblox": VoxbloxConfig(),
+    "voxblox 7.8 cm": VoxbloxConfig(voxel=0.078),
+    "fiesta": FiestaConfig(),
     "kinectfusion": KinectFusionConfig(),
     "kinectfusion 4 cm": KinectFusionConfig(voxel=0.04),
 }
