@@ -143,7 +143,8 @@ def memory(mapper: OnlineMapper) -> tuple[float, float, float]:
         # Two moments of the optimiser, the frozen copy, and the replayed images.
         state = 4 * field + sum(frame.depth.nbytes for frame in mapper.keyframes.frames)
     else:
-        field, state = mapper.field().nbytes, mapper.volume.nbytes
+        field = mapper.field().nbytes
+        state = mapper.nbytes - field
     with tempfile.TemporaryDirectory() as folder:
         mapper.save(Path(folder) / "map.safetensors")
         file = (Path(folder) / "map.safetensors").stat().st_size
