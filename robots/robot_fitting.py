@@ -11,11 +11,12 @@ import torch
 import trimesh
 from torch import Tensor
 
+from robots.convex_shape import Shape
 from robots.errors import RobotError, UnknownLinkError
 from robots.kinematic_tree import KinematicTree
 from robots.link_geometry import collision_pieces
 from robots.model import Robot
-from robots.sphere_fitting import BallCover, Shape, SphereFit
+from robots.sphere_fitting import GrowingCover, SphereFit
 from robots.spheres import SphereSet
 
 
@@ -26,7 +27,10 @@ class RobotFitConfig:
     # Bodies of this size and above get the full overshoot, smaller ones (size / coarse_size) ** size_exponent
     # of it: a palm wants finer spheres than a base.
     coarse_size: float = 0.5  # [m] diagonal of the bounding box
-    size_exponent: float = 0.75
+    size_exponent: float = 0.6
+    # The body that never moves collides with nothing but the robot itself; it gets this multiple.
+    static_factor: float = 2.0
+    gap: float = 0.001  # [m] that geometry may stand out of the spheres: it spares many at edges and corners
     pair_samples: int = 10_000  # random configurations behind the never/always rule
     near_samples: int = 100  # of these, the closest ones of a pair on which the real geometry is compared
     never_margin: float = 0.01  # [m] a pair counts as never colliding only if it stays this far apart
@@ -74,12 +78,11 @@ def fit_robot(
     bodies = [
         _Body(tree, links, pieces, lowest, config) for links in _rigid_bodies(tree, set(pieces) - set(skip))
     ]
-    overshoot = _overshoot_within(bodies, budget)
+    _share_out(bodies, budget)
     rows: dict[str, np.ndarray] = {}
     report = {}
     for body in bodies:
-        fit = body.cover.fit(overshoot * body.scale)
-        report[body.links[0]] = fit
+        report[body.links[0]] = fit = body.cover.fit()
         rows.update(body.spheres_by_link(fit.spheres))
     spheres = SphereSet(rows, floor_links=frozenset(floor_links) & set(rows))
     robot = Robot.from_urdf(urdf, spheres)
@@ -106,8 +109,15 @@ class _Body:
         self._shapes = {link: Shape(parts, config.seed) for link, parts in moved.items()}
         whole = Shape([piece for parts in moved.values() for piece in parts], config.seed)
         heights = [self._places[link][2, 3] + lowest[link] for link in links if link in lowest]
-        self.cover = BallCover(whole, max(heights) if heights else None)
-        self.scale = min(1.0, whole.size / config.coarse_size) ** config.size_exponent
+        self.cover = GrowingCover(whole, max(heights) if heights else None, config.gap)
+        self._scale = min(1.0, whole.size / config.coarse_size) ** config.size_exponent
+        if tree.root in links:
+            self._scale *= config.static_factor
+
+    @property
+    def excess(self) -> float:
+        """Overshoot [m] of the body so far, in proportion to what a body of its size may have."""
+        return self.cover.overshoot / self._scale
 
     def spheres_by_link(self, spheres: np.ndarray) -> dict[str, np.ndarray]:
         """Spheres (n, 4) of the body, each in the frame of the link that its centre lies deepest in."""
@@ -188,24 +198,14 @@ def _link_gaps(robot: Robot, q: Tensor, links: tuple[str, ...]) -> Tensor:
     return torch.stack([part.amin(2) for part in rows.split(counts, dim=2)], dim=2)
 
 
-def _overshoot_within(bodies: Sequence[_Body], budget: int) -> float:
-    """Smallest common overshoot [m] that keeps the sum of all covers within the budget (bisection)."""
-
-    def count(overshoot: float) -> float:
-        total = 0.0
-        for body in bodies:
-            chosen = body.cover.choose(overshoot * body.scale)
-            total += float("inf") if chosen is None else len(chosen)
-            if total > budget:
-                break
-        return total
-
-    low, high = 0.0, max(body.cover.shape.size / body.scale for body in bodies)
-    if count(high) > budget:
+def _share_out(bodies: Sequence[_Body], budget: int) -> None:
+    """Give each further ball to the body that is covered worst for its size."""
+    if budget < len(bodies):
         raise RobotError(
-            f"{budget} spheres do not cover {len(bodies)} bodies; give more, or a lower `lowest`"
+            f"{budget} spheres do not cover {len(bodies)} bodies that move against each other; give more"
         )
-    while high - low > 2e-4:
-        middle = (low + high) / 2
-        low, high = (low, middle) if count(middle) <= budget else (middle, high)
-    return high
+    for _ in range(budget - len(bodies)):
+        growing = [body for body in bodies if not body.cover.stalled]
+        if not growing:
+            return
+        max(growing, key=lambda body: body.excess).cover.add()
