@@ -24,13 +24,15 @@ from robots.errors import RobotError
 COVER_POINTS = 1_200  # surface points that each descent step looks at,
 WORST_POINTS = 500  # beside those of the check points that are covered worst at the time
 CHECK_POINTS = 12_000  # surface points that h is measured on
+BAD_POINTS = 1_000  # check points covered worst, which a further ball is to relieve
+EASED = 0.6  # share of the worst need below which relieving a point further counts for nothing
 INNER_POINTS = 300  # interior points that must be covered too, so that no hole opens inside of a big shape
 CANDIDATES = 500  # interior points drawn, from which a further ball starts
 GROW_STEPS = 50  # descent steps after each further ball,
 POLISH_STEPS = 400  # and at the end
 SOFTNESS = (2e-3, 2e-4)  # [m] of maxima and minima, first and last
 STEP = (2e-3, 6e-5)  # [m] of the descent, first and last
-HEIGHT_WEIGHT = 10.0  # a ball that reaches below the height limit counts as protruding by so much more
+HEIGHT_WEIGHT = 40.0  # a ball that reaches below the height limit counts as protruding by so much more
 
 
 class BallCover:
@@ -59,8 +61,8 @@ class BallCover:
         self._points = _tensor(np.concatenate([shape.surface_points(COVER_POINTS), inner]))
         self._check = _tensor(np.concatenate([shape.surface_points(CHECK_POINTS), inner]))
         self._candidates = _tensor(shape.inner_centres(CANDIDATES))
-        self._start_needs = self._needs(self._check, self._candidates)
-        self._centres = self._candidates[self._start_needs.amax(0).argmin()][None]
+        widest = self._needs(self._points, self._candidates).amax(0)
+        self._centres = self._candidates[widest.argmin()][None]
         self._raw = math.inf
         self._descend(GROW_STEPS)
 
@@ -75,8 +77,8 @@ class BallCover:
     def add(self) -> None:
         """Start another ball where it relieves the badly covered points most, then move all."""
         need = self._needs(self._check, self._centres).amin(1)
-        bad, worst = need.topk(min(2_000, len(need)))
-        eased = self._start_needs[worst].clamp(min=0.6 * float(bad[0]))
+        bad, worst = need.topk(min(BAD_POINTS, len(need)))
+        eased = self._needs(self._check[worst], self._candidates).clamp(min=EASED * float(bad[0]))
         gain = (bad[:, None] - eased).clamp(min=0).sum(0)
         self._centres = torch.cat([self._centres, self._candidates[gain.argmax()][None]])
         self._descend(GROW_STEPS)

@@ -20,7 +20,7 @@ from robots.errors import RobotError
 GROWTH_POINTS = 100_000  # surface points that the final radii must contain
 MEASURED_POINTS = 10_000  # fresh surface points that coverage is measured on
 WORTHWHILE = 0.97  # another ball counts as a gain if it lowers the overshoot to this share
-PATIENCE = 12  # balls in a row without a gain after which a shape gets no more
+PATIENCE = 20  # balls in a row without a gain after which a shape gets no more
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ def test_a_whole_robot_is_covered(tmp_path) -> None:
         skip=["wheel"],
         lowest={"base": -0.025},
         floor_links=["base"],
-        config=robots.RobotFitConfig(pair_samples=500),
+        config=robots.RobotFitConfig(pairs=robots.PairConfig(samples=500)),
     )
     assert len(spheres) <= 40
     assert set(report) == {"base", "upper", "lower"}  # the cap is fixed to the base: one body

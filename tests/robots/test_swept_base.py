@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 import robots
+from robots.swept_base import greedy_cover
 
 
 @pytest.fixture(scope="module")
