@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from robots.errors import UnknownRobotError
 from robots.registry import DATA, available, fetch_urdf, panda_urdf, tiago_urdf, ur5_urdf
-from robots.robot_fitting import fit_robot
+from robots.robot_fitting import RobotFitConfig, fit_robot
 from robots.sphere_fitting import SphereFit
 from robots.spheres import SphereSet, save_spheres
 
@@ -43,7 +43,9 @@ def refit(name: str, save: bool = False) -> tuple[SphereSet, dict[str, SphereFit
     elif name == "panda":
         spheres, report = fit_robot(panda_urdf(), 240, floor_links=["panda_link0"])
     elif name == "fetch":
-        spheres, report = fit_robot(fetch_urdf(), 280, floor_links=["base_link"])
+        # The arm works close to the base and the torso: no coarse spheres on the body that stands still.
+        config = RobotFitConfig(static_factor=1.2)
+        spheres, report = fit_robot(fetch_urdf(), 400, floor_links=["base_link"], config=config)
     elif name == "ur5":
         spheres, report = fit_robot(ur5_urdf(), 140, floor_links=["base_link"])
     else:
