@@ -115,9 +115,13 @@ class Checker:
                 shape = self._bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
             else:
                 height, radius = o["dimensions"]
-                shape = self._bullet.createCollisionShape(pybullet.GEOM_CYLINDER, radius=radius, height=height)
+                shape = self._bullet.createCollisionShape(
+                    pybullet.GEOM_CYLINDER, radius=radius, height=height
+                )
             self._solids.append(
-                self._bullet.createMultiBody(0, shape, basePosition=o["position"], baseOrientation=o["quat_xyzw"])
+                self._bullet.createMultiBody(
+                    0, shape, basePosition=o["position"], baseOrientation=o["quat_xyzw"]
+                )
             )
 
     def _pose(self, problem: Mapping[str, Any], q: np.ndarray) -> None:

@@ -107,7 +107,9 @@ def solids_of(field: CompilableField) -> Solids:
     )
 
 
-def _grow(nodes: list[tuple[int, np.ndarray, float, int, bool]], frame: int, balls: Float[np.ndarray, "n 4"]) -> None:
+def _grow(
+    nodes: list[tuple[int, np.ndarray, float, int, bool]], frame: int, balls: Float[np.ndarray, "n 4"]
+) -> None:
     """Append the subtree of some balls, halved along their longest extent until few are left."""
     at = len(nodes)
     centre, radius = _enclosing(balls)
@@ -153,4 +155,3 @@ def joint_weights(
             turned = place(poses(chain, moved), frame, centre)
             weights[joint] = max(weights[joint], float(np.linalg.norm(turned - before, axis=1).max()) / 1e-3)
     return weights
-
