@@ -33,6 +33,7 @@ class ExactShape:
         self.robot = robot
         low, high = limits[:, 0] - LIMIT_TOLERANCE, limits[:, 1] + LIMIT_TOLERANCE
         self.world = World(chain, tree, solids_of(field), low, high, weights, 0.0, 0.0, tolerance)
+        _compile(self.world)
         names = robot.sphere_links
         self._first_sphere = torch.tensor([names.index(name) for name in dict.fromkeys(names)])
 
@@ -74,6 +75,20 @@ def exact_shape(
     if config.unknown_confidence is not None:
         return None
     return ExactShape(robot, field, config.floor_tolerance)
+
+
+def _compile(world) -> None:  # type: ignore[no-untyped-def]
+    """Compile the search, or load it from numba's cache, before anybody looks at a clock."""
+    from planning.compiled.search import connect, length, shorten
+    from planning.compiled.states import first_blocked
+
+    if connect.signatures:
+        return
+    path = np.stack([0.5 * (world.low + world.high)] * 2)
+    connect(world, path[0], path[1], np.random.default_rng(0), 1.0, 1.0, 2, 1)
+    shorten(world, path, np.random.default_rng(0), 1.0, 1)
+    first_blocked(world, path, 1.0)
+    length(path)
 
 
 def _body(robot: CompilableRobot):  # type: ignore[no-untyped-def]

@@ -99,8 +99,8 @@ def rrt_connect(
     for name, q in (("start", start), ("goal", goal)):
         if len(q) != robot.num_dofs:
             raise TrajectoryError(f"rrt_connect: {name} has {len(q)} joints, the robot has {robot.num_dofs}.")
-    deadline = time.perf_counter() + config.seconds
     shape = exact_shape(robot, sdf, config.workspace)
+    deadline = time.perf_counter() + config.seconds
     if shape is not None:
         from planning.exact_search import search
 

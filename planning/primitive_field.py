@@ -45,9 +45,9 @@ class Solid:
     """
 
     kind: str
-    dimensions: tuple[float, ...]
-    position: tuple[float, float, float]
-    quat_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    dimensions: tuple[float | int, ...]
+    position: tuple[float | int, ...]
+    quat_xyzw: tuple[float | int, ...] = (0.0, 0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -127,7 +127,7 @@ class _Distance(torch.autograd.Function):
         return above.unsqueeze(-1) * gradient, None
 
 
-def _rotation(quat_xyzw: Sequence[float]) -> Float[np.ndarray, "3 3"]:
+def _rotation(quat_xyzw: Sequence[float | int]) -> Float[np.ndarray, "3 3"]:
     x, y, z, w = np.asarray(quat_xyzw, np.float64) / np.linalg.norm(quat_xyzw)
     return np.array(
         [

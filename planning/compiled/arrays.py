@@ -41,8 +41,8 @@ class SphereTree(NamedTuple):
 class Solids(NamedTuple):
     """Solids, one a row of `table`, and a voxel grid, empty where there is none.
 
-    A row holds the rotation from world to solid (0-8), the centre (9-11), sizes (12-14), the radius of a ball round the
-    solid (15) and its kind (16): 0 for a box with half sizes, 1 for a cylinder with radius and half height, 2 for a ball.
+    A row holds the rotation from world to solid (0-8), the centre (9-11), sizes (12-14), the radius of a ball round it
+    (15) and its kind (16): 0 for a box with half sizes, 1 for a cylinder with radius and half height, 2 for a ball.
     One table instead of an array for each, since passing arrays to small functions costs more than these compute.
     """
 
