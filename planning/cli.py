@@ -92,10 +92,9 @@ def table(results: list[dict[str, Any]]) -> str:
         lengths = [
             float(np.linalg.norm(np.diff(np.array(m["waypoints"]), axis=0), axis=1).sum()) for m in solved
         ]
-        lines.append(
-            f"{name:20s} {len(solved):4d}/{len(members):<4d} {np.median(seconds):7.3f}s {np.quantile(seconds, 0.95):7.3f}s"
-            f"  {np.median(lengths) if lengths else np.nan:.2f}"
-        )
+        median, p95 = np.quantile(seconds, [0.5, 0.95])
+        path = np.median(lengths) if lengths else np.nan
+        lines.append(f"{name:20s} {len(solved):4d}/{len(members):<4d} {median:7.3f}s {p95:7.3f}s  {path:.2f}")
     return "\n".join(lines)
 
 

@@ -78,6 +78,8 @@ def _problem(entry: dict[str, Any], where: str) -> Problem:
             for o in entry["obstacles"]
         )
         joints = tuple(entry["joints"])
+        if start.shape != (len(joints),) or goal.shape != start.shape:
+            raise ValueError(f"{len(joints)} joints, but start has {len(start)} values and goal {len(goal)}")
         problem = Problem(
             str(entry["set"]),
             int(entry["index"]),
@@ -89,10 +91,6 @@ def _problem(entry: dict[str, Any], where: str) -> Problem:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ProblemError(f"{where}: {type(error).__name__}: {error}.") from error
-    if start.shape != (len(joints),) or goal.shape != start.shape:
-        raise ProblemError(
-            f"{where}: {len(joints)} joints, but start has {len(start)} values and goal {len(goal)}."
-        )
     if not (torch.isfinite(start).all() and torch.isfinite(goal).all()):
         raise ProblemError(
             f"{where}: start and goal must be finite, got {start.tolist()} and {goal.tolist()}."
