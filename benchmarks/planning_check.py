@@ -72,7 +72,7 @@ class Checker:
             return "start differs"
         if not self._reaches(problem, path[-1], goal):
             return "goal missed"
-        for a, b in zip(path[:-1], path[1:], strict=True):
+        for a, b in itertools.pairwise(path):
             count = max(1, int(np.ceil(np.abs(b - a).max() / STEP)))
             for share in np.arange(count) / count:
                 if fault := self.state_fault(problem, a + share * (b - a)):

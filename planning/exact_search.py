@@ -15,7 +15,7 @@ from planning.initialise import NoPath, RrtConfig
 SAMPLES = 2000  # of the first attempt; each further one has twice as many
 NODES = 20_000
 MOTION_PER_METRE = 2.0  # edges of the compiled search are longer: the 1-norm overestimates motion
-CHECKS = 0.25  # resolution of the last look at a path, relative to that of the search
+CHECKS = 0.1  # resolution of the last look at a path, relative to that of the search
 
 
 def search(

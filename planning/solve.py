@@ -37,8 +37,9 @@ class PosableRobot(SphereRobot, Protocol):
 
 def _planner() -> PlannerConfig:
     # Goals are a few millimetres from the shelves they stand on, so all margins are small.
-    # The fine cover protrudes by 1.5 mm, so half a millimetre within it is still clear of the robot itself.
-    validation = ValidationConfig(max_joint_step=0.01, margin=-0.0005)
+    # The fine cover protrudes by 1.5 mm, so half a millimetre within it is still clear of the
+    # robot itself, and so are two covers that overlap by 3 mm of each other.
+    validation = ValidationConfig(max_joint_step=0.01, margin=-0.0005, self_margin=-0.003)
     return PlannerConfig(
         num_waypoints=50,
         chomp=ChompConfig(
@@ -51,7 +52,7 @@ def _planner() -> PlannerConfig:
             restarts=0,
         ),
         rrt=RrtConfig(
-            margin=0.005, reach=0.5, resolution=0.04, shortcut_rounds=150, seconds=5.0, candidates=6
+            margin=0.005, reach=0.5, resolution=0.04, shortcut_rounds=150, seconds=5.0, candidates=6, self_margin=-0.003
         ),
     )
 

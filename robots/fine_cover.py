@@ -7,7 +7,8 @@ Only the surface is covered, since nothing gets inside of a body without crossin
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+import heapq
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +31,15 @@ class FineCoverConfig:
         uncovered: how deep below the surface an obstacle's corner may get between the balls [m].
         spacing: distance of the surface points that must be covered [m].
         largest: radius of the largest ball [m]; larger ones cover more but are slow to tell apart.
+        large_area: surface [m^2] of a piece above which overshoot and spacing grow with its size, up to twice; bases
+            and torsos need not pass between two boards.
     """
 
     overshoot: float = 0.0015
     uncovered: float = 0.0005
     spacing: float = 0.003
     largest: float = 0.04
+    large_area: float = 0.12
 
 
 def fine_cover(urdf: str | Path, config: FineCoverConfig | None = None) -> dict[str, Balls]:
@@ -64,6 +68,8 @@ def cover_hull(piece: trimesh.Trimesh, config: FineCoverConfig, seed: int = 0) -
     faces k of slack_k(p) / (1 - n_k . n); grown by h it protrudes by at most h.
     """
     hull = piece.convex_hull
+    coarser = min(2.0, max(1.0, (hull.area / config.large_area) ** 0.5))
+    config = replace(config, overshoot=coarser * config.overshoot, spacing=coarser * config.spacing)
     targets, normals = _surface(hull, config.spacing, seed)
     planes = np.unique(
         np.round(np.c_[hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(1)], 7), axis=0
@@ -103,8 +109,6 @@ def _candidates(
 
 def _greedy(centres: np.ndarray, radii: np.ndarray, covers: np.ndarray, targets: int) -> Balls:
     """The balls of a greedy cover: always the one that contains most of what is not covered yet."""
-    import heapq
-
     left = np.ones(targets, dtype=bool)
     heap = [(-len(cover), i) for i, cover in enumerate(covers)]
     heapq.heapify(heap)
