@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from planning.exact_shape import ExactShape
+from planning.exact_shape import UNLIMITED, ExactShape
 from planning.initialise import NoPath, RrtConfig
 
 SAMPLES = 2000  # of the first attempt; each further one has twice as many
 NODES = 20_000
+LONGER = 0.04  # [s] after which a path that was found is not bettered by looking for others
 MOTION_PER_METRE = 2.0  # edges of the compiled search are longer: the 1-norm overestimates motion
 CHECKS = 0.1  # resolution of the last look at a path, relative to that of the search
 
@@ -49,7 +50,7 @@ def search(
     targets = [ends[i] for i in range(1, len(ends)) if usable[i]]
     if not targets:
         return NoPath("goal is blocked: in collision or out of limits")
-    best, found, samples = None, 0, SAMPLES
+    best, found, samples, started = None, 0, SAMPLES, time.perf_counter()
     for attempt in range(1000):
         goal = targets[attempt % len(targets)]
         tight = world._replace(
@@ -67,7 +68,8 @@ def search(
                 break
         else:
             samples *= 2
-        if time.perf_counter() > deadline:
+        now = time.perf_counter()
+        if now > deadline or (best is not None and now - started > LONGER):
             break
     if best is None:
         return NoPath(f"no path found in {config.seconds:g} s ({attempt + 1} attempts)")
@@ -79,7 +81,10 @@ def _with_end_margins(shape: ExactShape, ends: np.ndarray, config: RrtConfig):  
     from planning.compiled.states import free
 
     depth, _, gap, _ = shape.measure(torch.from_numpy(ends), np.inf, np.inf)
-    world = shape.world._replace(margin=config.min_margin, self_margin=config.self_margin)
+    low, high = shape.world.low, shape.world.high
+    low = np.where(low <= -UNLIMITED, ends.min(0) - config.unlimited_range, low)
+    high = np.where(high >= UNLIMITED, ends.max(0) + config.unlimited_range, high)
+    world = shape.world._replace(low=low, high=high, margin=config.min_margin, self_margin=config.self_margin)
     usable = [free(world, q) for q in ends]
     keep = [float(depth[i]) for i in range(len(ends)) if usable[i]]
     margin = max(config.min_margin, min([config.margin, *keep]) - 1e-9)

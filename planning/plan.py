@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import dataclass, field, replace
 
@@ -27,7 +28,8 @@ class PlannerConfig:
     """How a plan is sought.
 
     Args:
-        num_waypoints: of the trajectories.
+        num_waypoints: of the trajectories, at least.
+        spacing: longest distance of waypoints along a searched path in joint space [rad | m].
         duration: [s] given to trajectories before they are retimed.
         chomp: the optimiser, whose validation decides what success is.
         rrt: the search. Its margin is above the one that is checked, since its edges are tested more
@@ -35,6 +37,7 @@ class PlannerConfig:
     """
 
     num_waypoints: int = 50
+    spacing: float = 0.15
     duration: float = 5.0
     chomp: ChompConfig = field(default_factory=ChompConfig)
     rrt: RrtConfig = field(default_factory=RrtConfig)
@@ -137,7 +140,7 @@ class Planner:
     ) -> PlanResult:
         """CHOMP from a searched path, or where it leaves what is free, that path."""
         config = self.config
-        guess = Trajectory.through(path, config.num_waypoints, config.duration)
+        guess = Trajectory.through(_subdivided(path, config), duration=config.duration)
         result = chomp.optimise(guess, sdf, seconds)
         if result.success:
             return result
@@ -159,3 +162,14 @@ class Planner:
         waypoints = warm_start.waypoints.clone()
         waypoints[0], waypoints[-1] = line.waypoints[0], line.waypoints[-1]
         return Trajectory(waypoints, warm_start.times)
+
+
+def _subdivided(path: Float[Tensor, "k dof"], config: PlannerConfig) -> Float[Tensor, "n dof"]:
+    """A path with points added on its edges; its vertices stay, since cutting their corners may collide."""
+    lengths = path.diff(dim=0).norm(dim=1).tolist()
+    spacing = min(config.spacing, sum(lengths) / (config.num_waypoints - 1))
+    parts = []
+    for a, b, length in zip(path[:-1], path[1:], lengths, strict=True):
+        count = max(1, math.ceil(length / spacing - 1e-9))
+        parts.append(torch.lerp(a, b, (torch.arange(count) / count).to(path)[:, None]))
+    return torch.cat([*parts, path[-1:]])

@@ -104,10 +104,10 @@ class PrimitiveField:
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Signed distances [m] and their unit gradients at points [m], without an autograd graph."""
-        from planning.compiled.solids import distances_and_gradients
+        from planning.compiled.solids import FAR, distances_and_gradients
 
         flat = points.detach().reshape(-1, 3).double().numpy()
-        distance, gradient = distances_and_gradients(self._compiled, flat)
+        distance, gradient = distances_and_gradients(self._compiled, flat, np.full(1, FAR))
         return (
             torch.from_numpy(distance).to(points).view(points.shape[:-1]),
             torch.from_numpy(gradient).to(points).view(points.shape),

@@ -41,18 +41,25 @@ def _planner() -> PlannerConfig:
     # robot itself, and so are two covers that overlap by 3 mm of each other.
     validation = ValidationConfig(max_joint_step=0.01, margin=-0.0005, self_margin=-0.003)
     return PlannerConfig(
-        num_waypoints=50,
+        num_waypoints=40,
+        spacing=0.15,
         chomp=ChompConfig(
             eps=0.03,
-            objective=ObjectiveConfig(smoothness_weight=0.1, self_collision_eps=0.01),
-            descent=DescentConfig(polish=20, patience=5, tolerance=2e-2),
+            objective=ObjectiveConfig(smoothness_weight=0.02, self_collision_eps=0.01),
+            descent=DescentConfig(polish=10, patience=5, tolerance=2e-2),
             validation=validation,
             max_iterations=60,
-            max_tightenings=2,
+            max_tightenings=1,
             restarts=0,
         ),
         rrt=RrtConfig(
-            margin=0.005, reach=0.5, resolution=0.04, shortcut_rounds=150, seconds=5.0, candidates=6, self_margin=-0.003
+            margin=0.005,
+            reach=0.5,
+            resolution=0.04,
+            shortcut_rounds=400,
+            seconds=5.0,
+            candidates=6,
+            self_margin=-0.003,
         ),
     )
 

@@ -76,6 +76,11 @@ class Workspace:
             )
         self.field = field
         self.eps = self.cost_field.eps if self.cost_field else eps
+        self._solids = None
+        if isinstance(field, CompilableField):
+            from planning.compiled.arrays import solids_of
+
+            self._solids = solids_of(field)
         self.floor = (
             robot.floor_spheres if isinstance(robot, FloorRobot) and robot.floor_spheres.any() else None
         )
@@ -128,9 +133,13 @@ class Workspace:
         self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, " s"]
     ) -> tuple[Float[Tensor, "*batch s"], Float[Tensor, "*batch s 3"]]:
         """Clearances, and gradients of the field where they are below eps."""
-        if isinstance(self.field, CompilableField):  # one pass costs less than two
-            distance, gradient = self.field.distance_and_gradient(centres)
-            clearance = distance - radii
+        if self._solids is not None:
+            from planning.compiled.solids import distances_and_gradients
+
+            points = centres.detach().reshape(-1, 3).double().numpy()
+            far, up = distances_and_gradients(self._solids, points, (radii.double() + self.eps).numpy())
+            distance = torch.from_numpy(far).to(centres).view(centres.shape[:-1])
+            gradient, clearance = torch.from_numpy(up).to(centres).view(centres.shape), distance - radii
             if self.floor is not None:
                 clearance = clearance.masked_fill(
                     self._on_floor(distance[..., self.floor], centres), torch.inf

@@ -11,6 +11,9 @@ from numba import njit
 from planning.compiled.states import World, edge_free, free, motion
 
 
+SHORTER = 0.25  # of an edge that is blocked is tried before it is given up
+
+
 @njit(cache=True)
 @no_type_check
 def connect(
@@ -48,7 +51,11 @@ def connect(
             break
         near = _nearest(world, nodes[side], sizes[side], sample)
         new = _steered(world, nodes[side, near], sample, reach)
-        if not edge_free(world, nodes[side, near], new, resolution):
+        blocked = not edge_free(world, nodes[side, near], new, resolution)
+        if blocked:  # out of a narrow place by a shorter edge
+            new = nodes[side, near] + SHORTER * (new - nodes[side, near])
+            blocked = not edge_free(world, nodes[side, near], new, resolution)
+        if blocked:
             side = 1 - side
             continue
         here = _added(nodes[side], parents[side], sizes, side, new, near)
@@ -139,7 +146,11 @@ def length(path: np.ndarray) -> float:
 def shorten(
     world: World, path: np.ndarray, rng: np.random.Generator, resolution: float, rounds: int
 ) -> np.ndarray:
-    """Replace stretches of a free path between random points on it by straight edges, where these are free."""
+    """Replace stretches of a free path by straight motions where these are free and shorter.
+
+    By turns between two vertices, between two points anywhere, and of a single joint while the others move on as they
+    did (partial shortcuts, Geraerts and Overmars 2007).
+    """
     for k in range(rounds):
         if len(path) == 2:
             break
@@ -147,33 +158,61 @@ def shorten(
         for i in range(1, len(path)):
             arc[i] = arc[i - 1] + math.sqrt(np.sum((path[i] - path[i - 1]) ** 2))
         a, b = rng.random() * arc[-1], rng.random() * arc[-1]
-        if k % 2 == 0:  # between vertices, which removes them
+        if k % 3 == 0:  # vertices, of which those in between vanish
             a, b = arc[int(rng.random() * len(path))], arc[int(rng.random() * len(path))]
         if a > b:
             a, b = b, a
         i = min(np.searchsorted(arc, a, side="right") - 1, len(path) - 2)
         j = min(np.searchsorted(arc, b, side="right") - 1, len(path) - 2)
-        if arc[i] >= a and i == j:
+        if i == j:
             continue
         first = path[i] + (path[i + 1] - path[i]) * ((a - arc[i]) / (arc[i + 1] - arc[i]))
         last = path[j] + (path[j + 1] - path[j]) * ((b - arc[j]) / (arc[j + 1] - arc[j]))
-        saved = (b - a) - math.sqrt(np.sum((last - first) ** 2))
-        if saved <= 1e-6 or not free(world, first) or not free(world, last):
-            continue
-        if i == j or not edge_free(world, first, last, resolution):
-            continue
-        path = _spliced(path, i, j, first, last)
+        if k % 3 == 2:
+            joint = int(rng.random() * path.shape[1])
+            stretch = _one_joint_straight(path[i : j + 2], arc[i : j + 2], first, last, a, b, joint)
+        else:
+            stretch = np.empty((2, path.shape[1]))
+            stretch[0], stretch[1] = first, last
+        if b - a - length(stretch) > 1e-6 and _path_free(world, stretch, resolution):
+            path = _spliced(path, i, j, stretch)
     return path
 
 
 @njit(cache=True)
 @no_type_check
-def _spliced(path: np.ndarray, i: int, j: int, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Path up to vertex i, the edge first-last, and from vertex j + 1 on, without repeated points."""
-    out = np.empty((i + 1 + 2 + len(path) - j - 1, path.shape[1]))
+def _one_joint_straight(
+    path: np.ndarray, arc: np.ndarray, first: np.ndarray, last: np.ndarray, a: float, b: float, joint: int
+) -> np.ndarray:
+    """The stretch from arc length a to b of a path, with one joint moving evenly."""
+    out = np.empty((len(path), path.shape[1]))
+    out[0], out[-1] = first, last
+    for k in range(1, len(path) - 1):
+        out[k] = path[k]
+        out[k, joint] = first[joint] + (last[joint] - first[joint]) * ((arc[k] - a) / (b - a))
+    return out
+
+
+@njit(cache=True)
+@no_type_check
+def _path_free(world: World, path: np.ndarray, resolution: float) -> bool:
+    if not free(world, path[0]):
+        return False
+    for k in range(len(path) - 1):
+        if not edge_free(world, path[k], path[k + 1], resolution):
+            return False
+    return True
+
+
+@njit(cache=True)
+@no_type_check
+def _spliced(path: np.ndarray, i: int, j: int, stretch: np.ndarray) -> np.ndarray:
+    """Path up to vertex i, a stretch, and from vertex j + 1 on, without repeated points."""
+    n = len(stretch)
+    out = np.empty((i + 1 + n + len(path) - j - 1, path.shape[1]))
     out[: i + 1] = path[: i + 1]
-    out[i + 1], out[i + 2] = first, last
-    out[i + 3 :] = path[j + 1 :]
+    out[i + 1 : i + 1 + n] = stretch
+    out[i + 1 + n :] = path[j + 1 :]
     keep = 1
     for k in range(1, len(out)):
         if np.sum((out[k] - out[keep - 1]) ** 2) > 1e-18:

@@ -150,14 +150,22 @@ def distances(solids: Solids, points: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 @no_type_check
-def distances_and_gradients(solids: Solids, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances (n,) [m] and unit gradients (n, 3) at points (n, 3)."""
+def distances_and_gradients(
+    solids: Solids, points: np.ndarray, within: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distances (n,) [m] and unit gradients (n, 3) at points (n, 3).
+
+    Distances above within[p % len(within)] are cut off there, with a zero gradient, which saves most of the work.
+    """
     out = np.empty(len(points))
     gradients = np.empty((len(points), 3))
     for p in range(len(points)):
         x, y, z = points[p]
-        nearest, gx, gy, gz = grid_sample(solids, x, y, z)
-        winner = -1
+        nearest, gx, gy, gz, winner = within[p % len(within)], 0.0, 0.0, 0.0, -1
+        if len(solids.grid) > 0:
+            d, ux, uy, uz = grid_sample(solids, x, y, z)
+            if not d >= nearest:
+                nearest, gx, gy, gz = d, ux, uy, uz
         for i in range(len(solids.table)):
             if not beyond(solids.table, i, x, y, z, max(nearest, 0.0)):
                 d = solid_distance(solids.table, i, x, y, z)
