@@ -13,6 +13,7 @@ from planning.exact_shape import UNLIMITED, ExactShape
 from planning.initialise import NoPath, RrtConfig
 
 SAMPLES = 2000  # of the first attempt; each further one has twice as many
+MOST_SAMPLES = 100_000
 NODES = 20_000
 LONGER = 0.04  # [s] after which a path that was found is not bettered by looking for others
 MOTION_PER_METRE = 2.0  # edges of the compiled search are longer: the 1-norm overestimates motion
@@ -51,23 +52,26 @@ def search(
     if not targets:
         return NoPath("goal is blocked: in collision or out of limits")
     best, found, samples, started = None, 0, SAMPLES, time.perf_counter()
+    resolution = config.resolution
     for attempt in range(1000):
         goal = targets[attempt % len(targets)]
         tight = world._replace(
             margin=world.margin * 0.5 ** (attempt // (2 * len(targets)) if best is None else 0)
         )
         reach = MOTION_PER_METRE * config.reach
-        path = connect(tight, ends[0], goal, rng, reach, config.resolution, NODES, samples)
+        path = connect(tight, ends[0], goal, rng, reach, resolution, NODES, samples)
         if len(path):
-            path = shorten(tight, path, rng, config.resolution, config.shortcut_rounds)
+            path = shorten(tight, path, rng, resolution, config.shortcut_rounds)
         if len(path) and first_blocked(tight, path, CHECKS * config.resolution) < 0:
             found += 1
             if best is None or length(path) < length(best):
                 best = path
             if found >= config.candidates * len(targets) or len(path) == 2:
                 break
+        elif len(path):  # an obstacle was between two states of an edge
+            resolution *= 0.5
         else:
-            samples *= 2
+            samples = min(2 * samples, MOST_SAMPLES)
         now = time.perf_counter()
         if now > deadline or (best is not None and now - started > LONGER):
             break

@@ -53,6 +53,7 @@ def _planner() -> PlannerConfig:
             restarts=0,
         ),
         rrt=RrtConfig(
+            min_margin=-0.0005,
             margin=0.005,
             reach=0.5,
             resolution=0.04,

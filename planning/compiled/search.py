@@ -10,7 +10,6 @@ from numba import njit
 
 from planning.compiled.states import World, edge_free, free, motion
 
-
 SHORTER = 0.25  # of an edge that is blocked is tried before it is given up
 
 
@@ -198,7 +197,7 @@ def _one_joint_straight(
 def _path_free(world: World, path: np.ndarray, resolution: float) -> bool:
     if not free(world, path[0]):
         return False
-    for k in range(len(path) - 1):
+    for k in range(len(path) - 1):  # noqa: SIM110  (numba has no all)
         if not edge_free(world, path[k], path[k + 1], resolution):
             return False
     return True
