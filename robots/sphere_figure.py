@@ -47,9 +47,7 @@ def save_sphere_figure(path: str | Path, robot: Robot, q: Tensor | None = None) 
 
 def _draw(axes: Axes3D, parts: list[np.ndarray], colour: str, opacity: float) -> None:
     triangles = np.concatenate(parts)
-    axes.add_collection3d(
-        Poly3DCollection(triangles, facecolors=colour, edgecolors="none", alpha=opacity, shade=True)
-    )
+    axes.add_collection3d(Poly3DCollection(triangles, facecolors=colour, alpha=opacity, shade=True))
 
 
 def _fit_axes(axes: Axes3D, points: np.ndarray) -> None:
