@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from robots.errors import RobotError, UnknownJointError
+from robots.errors import RobotError, SphereFileError, UnknownJointError
 from robots.kinematic_tree import KinematicTree
 from robots.moving_frames import MovingFrames
 from robots.spheres import SphereSet, load_spheres
@@ -244,12 +244,27 @@ class Robot:
         if unknown:
             raise UnknownJointError(f"cannot fix {unknown}; joints that can be held: {allowed}")
         joints = tuple(joint for joint in self._joints if joint not in values)
+        return self._changed(
+            joints=joints, held={**self.held, **{name: float(value) for name, value in values.items()}}
+        )
+
+    def with_spheres(self, spheres: SphereSet | str | Path) -> Robot:
+        """The same robot covered by another sphere set; raises `SphereFileError` and `UnknownLinkError`."""
+        return self._changed(sphere_set=spheres if isinstance(spheres, SphereSet) else load_spheres(spheres))
+
+    def _changed(
+        self,
+        *,
+        sphere_set: SphereSet | None = None,
+        joints: Sequence[str] | None = None,
+        held: Mapping[str, float] | None = None,
+    ) -> Robot:
         return Robot(
             self.tree,
-            self.sphere_set,
+            self.sphere_set if sphere_set is None else sphere_set,
             urdf_path=self.urdf_path,
-            joints=joints,
-            held={**self.held, **{name: float(value) for name, value in values.items()}},
+            joints=self._joints if joints is None else joints,
+            held=self.held if held is None else held,
             named=self._named,
             tool_link=self.tool_link,
             gripper=self.gripper,
@@ -272,6 +287,8 @@ class Robot:
         for link in filter(None, (self.tool_link, self.camera_link)):
             self.tree.require_link(link)
         self.sphere_set.check_links(self.tree.links)
+        if len(self.sphere_set) == 0:
+            raise SphereFileError(f"{self.name!r} has no collision sphere; give at least one")
 
     def _checked(self, q: Tensor) -> Tensor:
         if q.ndim == 0 or q.shape[-1] != self.num_dofs:
