@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
@@ -12,6 +14,24 @@ SIDE = 8
 VOXELS = SIDE**3
 # The table of bricks grows by whole blocks of this many bricks a side.
 GROWTH = 4
+
+
+class Bricks(NamedTuple):
+    """What compiled code sees of a brick volume.
+
+    Args:
+        table: (nx, ny, nz) int32 number of every brick, -1 where none is stored.
+        corner: (3,) lattice index of the table's first brick.
+        distance: (bricks, 512) float32 [m].
+        weight: (bricks, 512) float32.
+        voxel: edge of a voxel [m].
+    """
+
+    table: np.ndarray
+    corner: np.ndarray
+    distance: np.ndarray
+    weight: np.ndarray
+    voxel: float
 
 
 class BrickVolume:
@@ -41,6 +61,20 @@ class BrickVolume:
     def weight(self) -> Float[np.ndarray, "bricks 512"]:
         """Sum of the weights of all measurements, up to a limit; 0 where a voxel was never observed."""
         return self._weight[: self.count]
+
+    @property
+    def arrays(self) -> Bricks:
+        """For compiled code, which may change the distances and weights in place."""
+        return Bricks(self.table, self.corner, self._distance, self._weight, self.voxel)
+
+    def box(
+        self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]
+    ) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
+        """First and one past the last array index of the bricks in a world box [m], clipped to the table."""
+        edge, shape = SIDE * self.voxel, np.array(self.table.shape)
+        begin = np.floor(np.asarray(lower) / edge).astype(np.int64) - self.corner
+        end = np.floor(np.asarray(upper) / edge).astype(np.int64) + 1 - self.corner
+        return np.clip(begin, 0, shape), np.clip(end, 0, shape)
 
     @property
     def nbytes(self) -> int:
@@ -74,10 +108,27 @@ class BrickVolume:
     def add(self, places: Int[np.ndarray, "n 3"]) -> None:
         """Make room for the bricks at these array indices of the table, which must not exist yet."""
         while self.count + len(places) > len(self._distance):
-            self._distance = np.concatenate([self._distance, np.zeros_like(self._distance)])
-            self._weight = np.concatenate([self._weight, np.zeros_like(self._weight)])
+            more = np.zeros((max(256, len(self._distance)), VOXELS), dtype=np.float32)
+            self._distance = np.concatenate([self._distance, more])
+            self._weight = np.concatenate([self._weight, more])
         self.table[tuple(places.T)] = np.arange(self.count, self.count + len(places))
         self.count += len(places)
+
+
+    def restore(
+        self, table: Int[np.ndarray, "nx ny nz"], distance: Float[np.ndarray, "n 512"], weight: Float[np.ndarray, "n 512"]
+    ) -> None:
+        """Take over the bricks of another volume.
+
+        Raises:
+            FrameError: the arrays do not fit each other.
+        """
+        if table.ndim != 3 or distance.shape != weight.shape or distance.shape[1:] != (VOXELS,):
+            raise FrameError(f"bricks of shapes {table.shape}, {distance.shape} and {weight.shape} do not fit")
+        if table.max(initial=-1) >= len(distance) or table.min(initial=-1) < -1:
+            raise FrameError(f"a table of bricks up to {table.max()} does not fit {len(distance)} bricks")
+        self.table, self.count = table.astype(np.int32), len(distance)
+        self._distance, self._weight = distance.astype(np.float32), weight.astype(np.float32)
 
 
 def moved(old: np.ndarray, corner: np.ndarray, first: np.ndarray, size: np.ndarray, empty: float) -> np.ndarray:
@@ -90,13 +141,25 @@ def moved(old: np.ndarray, corner: np.ndarray, first: np.ndarray, size: np.ndarr
 
 
 @njit(cache=True)
-def missing_bricks(table, corner, edge, depth, stride, noise, least, intrinsics, T_world_camera):  # type: ignore[no-untyped-def]
+def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[float, float]:
+    """Distance [m] and weight of the voxel at a lattice index; 0 and 0 where nothing is stored."""
+    table, corner = bricks.table, bricks.corner
+    a, b, c = (i >> 3) - corner[0], (j >> 3) - corner[1], (k >> 3) - corner[2]
+    if a < 0 or b < 0 or c < 0 or a >= table.shape[0] or b >= table.shape[1] or c >= table.shape[2]:
+        return np.float32(0), np.float32(0)
+    brick = table[a, b, c]
+    if brick < 0:
+        return np.float32(0), np.float32(0)
+    at = (i & 7) * 64 + (j & 7) * 8 + (k & 7)
+    return bricks.distance[brick, at], bricks.weight[brick, at]
+
+
+@njit(cache=True)
+def missing_bricks(bricks: Bricks, depth, stride, noise, least, intrinsics, T_world_camera):  # type: ignore[no-untyped-def]
     """Array indices (n, 3) of the bricks that surfaces of a depth image need and the table lacks.
 
     Args:
-        table: (nx, ny, nz), changed: -2 marks what was found.
-        corner: of the table.
-        edge: of a brick [m].
+        bricks: its table is changed: -2 marks what was found.
         depth: (h, w) z-depth [m], 0 = unknown.
         stride: every so many pixels is looked at.
         noise: truncation per squared depth.
@@ -106,6 +169,7 @@ def missing_bricks(table, corner, edge, depth, stride, noise, least, intrinsics,
     """
     fx, fy, cx, cy = intrinsics
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    table, corner, edge = bricks.table, bricks.corner, 8 * bricks.voxel
     found = []
     for v in range(0, depth.shape[0], stride):
         for u in range(0, depth.shape[1], stride):

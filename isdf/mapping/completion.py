@@ -6,9 +6,12 @@ bounds meet it has nothing to say. With the distance it gives the error it expec
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from jaxtyping import Float
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from .evidence import Evidence
@@ -17,6 +20,7 @@ CHANNELS = 8
 # A window's sides must be multiples of this many nodes: the network halves them three times.
 STRIDE = 8
 REACH = 3.0
+WEIGHTS = Path(__file__).parent.parent / "data" / "completion.safetensors"
 
 
 def features(evidence: Evidence) -> Float[Tensor, "8 nx ny nz"]:
@@ -66,3 +70,10 @@ class CompletionNet(nn.Module):
 
 def _twice(x: Tensor) -> Tensor:
     return nn.functional.interpolate(x, scale_factor=2, mode="trilinear", align_corners=False)
+
+
+def load_network() -> CompletionNet:
+    """The trained network that comes with the package; see benchmarks/train_completion.py."""
+    network = CompletionNet()
+    network.load_state_dict({name: values.float() for name, values in load_file(WEIGHTS).items()})
+    return network.eval().requires_grad_(False)

@@ -23,10 +23,12 @@ FREE, FREE_ABOVE, DOUBT = 255, 127, 16
 MARGIN, NOISE = 0.04, 0.01
 # How far behind a measured surface a node is contradicted [m].
 BAND = 0.12
+# The same behind something that has just appeared [m].
+INSIDE = 0.6
 
 
 @njit(cache=True)
-def look_through(free, corner, spacing, begin, end, depth, intrinsics, T_camera_world):  # type: ignore[no-untyped-def]
+def look_through(free, corner, spacing, begin, end, depth, appeared, stride, intrinsics, T_camera_world):  # type: ignore[no-untyped-def]
     """Mark the nodes of a box that a depth image looks through.
 
     Args:
@@ -36,6 +38,8 @@ def look_through(free, corner, spacing, begin, end, depth, intrinsics, T_camera_
         begin: (3,) first node of the box.
         end: (3,) one past its last node.
         depth: (h, w) float32 z-depth [m], 0 where unknown.
+        appeared: (h / stride, w / stride) bool: something is measured there where space was free.
+        stride: in pixels.
         intrinsics: fx, fy, cx, cy.
         T_camera_world: (4, 4).
     """
@@ -60,8 +64,12 @@ def look_through(free, corner, spacing, begin, end, depth, intrinsics, T_camera_
                     continue
                 if ahead > MARGIN + NOISE * z * z:
                     free[i, j, k] = FREE
-                elif -BAND < ahead < 0 and free[i, j, k] > 0:
-                    free[i, j, k] = max(0, free[i, j, k] - DOUBT)
+                elif ahead < 0 and free[i, j, k] > 0:
+                    # What stands where space was free hides what is in it, too, not only its front.
+                    if ahead > -INSIDE and appeared[v // stride, u // stride]:
+                        free[i, j, k] = max(0, free[i, j, k] - 4 * DOUBT)
+                    elif ahead > -BAND:
+                        free[i, j, k] = max(0, free[i, j, k] - DOUBT)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numba import njit
 from torch import Tensor
 
 from ..field import GridField, _AnalyticGradient, bake, check_points
-from .lattice import FINE, STEP
+from .lattice import FINE, STEP, LatticeArrays
 
 # Below this many points a second thread costs more than it saves.
 PARALLEL = 20_000
@@ -181,3 +181,22 @@ def _confidence(points, origin, spacing, confidence, out):  # type: ignore[no-un
                     w = (tx if a else 1 - tx) * (ty if b else 1 - ty) * (tz if c else 1 - tz)
                     total += w * confidence[i + a, j + b, k + c]
         out[n] = total / 255
+
+
+@njit(cache=True)
+def query_one(lattice: LatticeArrays, point):  # type: ignore[no-untyped-def]
+    """Distance [m] and confidence (0 .. 255) at the node closest to a point (3,), and whether it was looked through."""
+    at = np.empty(3, dtype=np.int64)
+    for axis in range(3):
+        at[axis] = int(np.floor((point[axis] - lattice.origin[axis]) / lattice.spacing + 0.5))
+        if at[axis] < 0 or at[axis] >= lattice.value.shape[axis]:
+            return np.float32(0), 0, False
+    i, j, k = at
+    value = lattice.value[i, j, k]
+    # Distances change by no more than the way between node and point.
+    way = 0.0
+    for axis in range(3):
+        way += (point[axis] - lattice.origin[axis] - lattice.spacing * at[axis]) ** 2
+    way = np.sqrt(way)
+    value = value - np.float32(way) if value > 0 else value + np.float32(way)
+    return value, int(lattice.confidence[i, j, k]), lattice.evidence[i, j, k] > 127

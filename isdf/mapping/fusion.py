@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from .bricks import Bricks
+
 # Nearer than this [m] the noise of depth cameras no longer falls with the square of the depth.
 NOISE_FLOOR_DEPTH = 0.5
 # Contradicted evidence counts as much as this many views like the one that contradicts it.
@@ -16,17 +18,11 @@ TRUST = 8.0
 
 
 @njit(cache=True)
-def fuse(
-    table, corner, distances, weights, voxel, begin, end, depth, noise, least, max_weight, intrinsics, T_camera_world
-):  # type: ignore[no-untyped-def]
-    """Average one depth image into the stored voxels of a box of bricks, in place; returns the voxels changed.
+def fuse(bricks: Bricks, begin, end, depth, noise, least, max_weight, intrinsics, T_camera_world):  # type: ignore[no-untyped-def]
+    """Average one depth image into the stored voxels of a box of bricks, in place.
 
     Args:
-        table: (nx, ny, nz) index of every brick, -1 where none is stored.
-        corner: lattice index of the table's first brick.
-        distances: (bricks, 512) [m].
-        weights: (bricks, 512).
-        voxel: edge [m].
+        bricks: changed.
         begin: (3,) first brick of the box, as array index.
         end: (3,) one past its last.
         depth: (h, w) float32 z-depth [m], 0 = unknown.
@@ -39,7 +35,7 @@ def fuse(
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-    changed = 0
+    table, corner, distances, weights, voxel = bricks
     radius = 7.0 * voxel
     for bi in range(begin[0], end[0]):
         for bj in range(begin[1], end[1]):
@@ -96,5 +92,3 @@ def fuse(
                             total = before + weight
                             distances[brick, at] = (old * before + value * weight) / total
                             weights[brick, at] = min(total, max_weight)
-                            changed += 1
-    return changed

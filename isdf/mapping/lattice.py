@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float, Int, Int8, UInt8
+from jaxtyping import Bool, Float, Int, Int8, UInt8
 
 from .bricks import moved
 
@@ -14,6 +16,28 @@ BLOCK = FINE**3
 STEP = 0.0012
 # The lattice grows by whole blocks of this many coarse nodes a side.
 GROWTH = 8
+
+
+class LatticeArrays(NamedTuple):
+    """What compiled code sees of a lattice.
+
+    Args:
+        origin: (3,) world position of the first node [m].
+        spacing: of coarse nodes [m].
+        value: (nx, ny, nz) float32 [m].
+        confidence: uint8, of the same shape as all that follow.
+        block: int32.
+        corrections: (n, 125) int8.
+        evidence: uint8, see `isdf.mapping.evidence`; a single node where it is not needed.
+    """
+
+    origin: np.ndarray
+    spacing: float
+    value: np.ndarray
+    confidence: np.ndarray
+    block: np.ndarray
+    corrections: np.ndarray
+    evidence: np.ndarray
 
 
 class Lattice:
@@ -38,12 +62,17 @@ class Lattice:
         self.evidence: UInt8[np.ndarray, "nx ny nz"] = np.zeros((0, 0, 0), dtype=np.uint8)
         self.share = np.zeros((0, 0, 0), dtype=np.float16)
         self.width = np.zeros((0, 0, 0), dtype=np.float16)
-        self.guessed = np.zeros((0, 0, 0), dtype=np.bool_)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Coarse nodes an axis."""
         return self.value.shape
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays [bytes]."""
+        nodes = (self.value, self.confidence, self.block, self.evidence, self.share, self.width)
+        return sum(a.nbytes for a in nodes) + self.corrections[: self.used].nbytes
 
     def include(self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]) -> None:
         """Grow to cover a world box [m]; new nodes are unknown."""
@@ -57,7 +86,7 @@ class Lattice:
         if np.array_equal(size, self.shape):
             return
         for name, empty in (
-            ("value", 1.0), ("confidence", 0), ("block", -1), ("evidence", 0), ("share", 0.5), ("width", -0.7), ("guessed", 0)
+            ("value", 1.0), ("confidence", 0), ("block", -1), ("evidence", 0), ("share", 0.5), ("width", -0.7)
         ):  # fmt: skip
             setattr(self, name, moved(getattr(self, name), self.corner, first, size, empty))
         self.corner = first
@@ -71,12 +100,36 @@ class Lattice:
         shape = np.array(self.shape)
         return np.clip(begin, 0, shape), np.clip(end, 0, shape)
 
-    def take_blocks(self, count: int) -> Int[np.ndarray, "n"]:
-        """Numbers of unused blocks of corrections."""
+    def reassign(
+        self, block: Int[np.ndarray, "mx my mz"], wanted: Bool[np.ndarray, "mx my mz"], unwanted: Bool[np.ndarray, "mx my mz"]
+    ) -> Bool[np.ndarray, "mx my mz"]:
+        """Give blocks of corrections to wanted cells that have none and take those of unwanted ones.
+
+        Args:
+            block: numbers of the cells of a window, changed.
+            wanted: cells to be refined.
+            unwanted: cells that need no refinement.
+
+        Returns:
+            The cells that got a block; what it holds is of another cell.
+        """
+        dropped = unwanted & (block >= 0)
+        self.spare += block[dropped].tolist()
+        block[dropped] = -1
+        fresh = wanted & (block < 0)
+        count = int(fresh.sum())
         reused = [self.spare.pop() for _ in range(min(count, len(self.spare)))]
-        fresh = count - len(reused)
-        while self.used + fresh > len(self.corrections):
-            self.corrections = np.concatenate([self.corrections, np.zeros_like(self.corrections)])
-        numbers = np.concatenate([np.array(reused, dtype=np.int32), np.arange(self.used, self.used + fresh, dtype=np.int32)])
-        self.used += fresh
-        return numbers.astype(np.int32)
+        added = count - len(reused)
+        while self.used + added > len(self.corrections):
+            more = np.zeros((max(1024, len(self.corrections)), BLOCK), dtype=np.int8)
+            self.corrections = np.concatenate([self.corrections, more])
+        block[fresh] = [*reused, *range(self.used, self.used + added)]
+        self.used += added
+        return fresh
+
+    @property
+    def arrays(self) -> LatticeArrays:
+        """For compiled code."""
+        return LatticeArrays(
+            self.corner * self.spacing, self.spacing, self.value, self.confidence, self.block, self.corrections, self.evidence
+        )

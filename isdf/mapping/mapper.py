@@ -1,9 +1,10 @@
-"""The default map: what the views prove, and between their bounds what a network guesses."""
+"""The default map: distances between what the views prove, guessed by a network where they leave a gap."""
 
 from __future__ import annotations
 
 import logging
 import math
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,39 +18,40 @@ from ..cost import CostField
 from ..errors import ConfigError, FrameError, NotReadyError
 from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
-from .bricks import SIDE, BrickVolume, missing_bricks
-from .completion import STRIDE, CompletionNet, features
-from .evidence import gather, look_through
+from .agreement import compare
+from .bricks import BrickVolume, missing_bricks
+from .completion import load_network
+from .evidence import look_through
 from .field import LatticeField
 from .fusion import fuse
 from .lattice import Lattice
-from .nearest import nearest_points
-from .refresh import cells_to_refine, coarse_values, fine_values
-from .seeds import surface_seeds
+from .refresh import guess, refresh
 
 logger = logging.getLogger(__name__)
 
-RATIO = 4  # voxels between coarse nodes
-HALF_RATIO = 2  # voxels between the nodes whose nearest seeds are found
-# Box about the camera in which distances are guessed anew [m], along and across the vertical.
-GUESS_ACROSS, GUESS_ALONG = 4.48, 2.56
-# The map reaches this far beyond what was seen [m].
-BEYOND = np.array([2.5, 2.5, 1.5])
-# Seeds this far outside a window still count in it [m]; nodes this far outside what was viewed are written anew.
-SEED_MARGIN, WRITE_MARGIN = 2.5, 0.8
-WEIGHTS = Path(__file__).parent.parent / "data" / "completion.safetensors"
+# Fine voxels between the nodes of the coarse lattice.
+RATIO = 4
+# The map reaches this far beyond what was seen, across and along the vertical [m].
+BEYOND_ACROSS, BEYOND_ALONG = 2.5, 1.5
+# Distances are written anew this far outside what a frame looked at [m].
+MARGIN = 0.8
+# A frame is passed over when more than this share of at least so many points contradicts the map, but no more than
+# so many frames in a row: then the world has changed, not the frame.
+CONTRADICTED, JUDGED, PATIENCE = 0.45, 60, 5
+# Columns of an image that are compared with the map.
+COLUMNS = 80
 
 
 @dataclass(frozen=True)
 class MapperConfig:
-    """The default map's settings.
+    """Settings of the default map.
 
     Args:
-        voxel: edge of a fine voxel [m]; coarse nodes lie four of them apart.
+        voxel: edge of a fine voxel [m]; the coarse nodes lie four of them apart, and the network knows no other.
         truncation: least truncation of the fused distances [m].
         truncation_noise: truncation per squared depth [m / m^2]: it follows the noise of far depth.
         max_depth: pixels measured farther than this are ignored [m].
-        max_weight: of a voxel, in measurements at 1 m.
+        max_weight: of a voxel, in measurements at 1 m: enough to average the noise.
         refresh_period: least frame time between two refreshes of the distances [s].
         guess_period: least frame time between two runs of the network [s].
         max_bricks: a frame that needs a larger table of bricks (of eight voxels a side) is refused.
@@ -69,13 +71,25 @@ class MapperConfig:
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")
         if not self.truncation > 2 * self.voxel:
-            raise ConfigError(f"truncation must be more than two voxels, got {self.truncation} m and {self.voxel} m")
-        if min(self.refresh_period, self.guess_period, self.truncation_noise) < 0:
-            raise ConfigError("refresh_period, guess_period and truncation_noise must be zero or more")
+            raise ConfigError(
+                f"truncation must be more than two voxels, got {self.truncation} m with a voxel of {self.voxel} m"
+            )
+        for name in ("refresh_period", "guess_period", "truncation_noise"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must be zero or more, got {getattr(self, name)}")
 
 
 class Mapper:
-    """Maps posed depth images online."""
+    """Maps posed depth images online: fuse each, write distances down now and then, guess between bounds.
+
+    `integrate` fuses at once and refreshes the distances when `refresh_period` of frame time has passed; `step` and
+    `run_for` refresh whatever came in since. Frames that contradict the map or repeat the last image are passed over
+    with a line in the log.
+
+    Args:
+        config: see `MapperConfig`.
+        device: where the network runs; everything else runs on the CPU.
+    """
 
     def __init__(self, config: MapperConfig | None = None, device: str | torch.device = "cpu") -> None:
         self.config = config or MapperConfig()
@@ -83,162 +97,203 @@ class Mapper:
         self.bricks = BrickVolume(self.config.voxel, self.config.max_bricks)
         self.lattice = Lattice(RATIO * self.config.voxel)
         self.network = load_network().to(self.device)
-        self.frames_seen = self.steps = 0
-        self.times: dict[str, float] = {}
+        self.frames_seen = self.frames_skipped = self.steps = 0
+        self.up = np.zeros(3)
         self._bounds = nothing_seen()
         self._viewed: np.ndarray | None = None
         self._refreshed_at = self._guessed_at = -math.inf
-        self._up = np.zeros(3)
         self._ready = False
+        self._last: np.ndarray | None = None
+        self._frozen, self._refused = False, 0
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"]:
+        """Lower and upper corner [m] of the surfaces and cameras seen so far; NotReadyError before the first."""
         if self.frames_seen == 0:
             raise NotReadyError("nothing was seen yet: call mapper.integrate(frame) first")
         return self._bounds.clone()
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of all that mapping goes on from, without the network [bytes]."""
+        return self.bricks.nbytes + self.lattice.nbytes
+
     def integrate(self, frame: Any) -> None:
+        """Fuse a new frame, and refresh the distances when they are due.
+
+        Args:
+            frame: an `isdf.DepthFrame`, or any object with its attributes.
+
+        Raises:
+            FrameError: the frame cannot be used; the map is as it was before the call.
+        """
         frame = DepthFrame.of(frame).to(torch.device("cpu"))
-        depth = frame.depth.numpy()
-        depth = np.where(depth <= self.config.max_depth, depth, np.float32(0))
-        if not depth.any():
-            raise FrameError("no pixel in reach")
-        T = frame.T_world_camera.numpy()
-        box = self._view_box(depth, frame, T)
+        depth, T = self._usable(frame), frame.T_world_camera.numpy()
+        if self._repeats(depth, frame.time):
+            return
+        stride = max(1, depth.shape[1] // COLUMNS)
+        appeared = self._appeared(depth, T, stride, frame)
+        if appeared is None:
+            return
+        box = self._view(depth, T, frame)
         self.bricks.include(box[0], box[1])
         self._bounds = grown(self._bounds, frame, self.config.max_depth)
+        self.up -= T[:3, 1]
+        beyond = np.full(3, BEYOND_ACROSS)
+        beyond[np.abs(self.up).argmax()] = BEYOND_ALONG
         seen = self._bounds.numpy().astype(float)
-        self.lattice.include(np.minimum(seen[0] - BEYOND, box[0]), np.maximum(seen[1] + BEYOND, box[1]))
-        self._fuse(depth, frame, T, box)
-        self._up -= T[:3, 1]
+        self.lattice.include(np.minimum(seen[0] - beyond, box[0]), np.maximum(seen[1] + beyond, box[1]))
+        self._fuse(depth, T, frame, box, appeared, stride)
         self.frames_seen += 1
-        margin = np.array([[-WRITE_MARGIN], [WRITE_MARGIN]])
-        viewed = box + margin
-        self._viewed = viewed if self._viewed is None else np.stack([np.minimum(self._viewed[0], viewed[0]), np.maximum(self._viewed[1], viewed[1])])
-        if not 0 < frame.time - self._refreshed_at < self.config.refresh_period or not self._ready:
-            guess = not 0 < frame.time - self._guessed_at < self.config.guess_period
-            if guess:
-                self._guess(T[:3, 3])
-                self._guessed_at = frame.time
+        self._touch(box + np.array([[-MARGIN], [MARGIN]]))
+        # A clock that stands still or jumps back must not stop the refreshing.
+        if not self._ready or not 0 < frame.time - self._guessed_at < self.config.guess_period:
+            self._guess(T[:3, 3])
+            self._guessed_at = frame.time
+        if not self._ready or not 0 < frame.time - self._refreshed_at < self.config.refresh_period:
             self.refresh()
             self._refreshed_at = frame.time
 
-    def _view_box(self, depth: np.ndarray, frame: DepthFrame, T: np.ndarray) -> np.ndarray:
-        camera = frame.camera
-        v, u = np.nonzero(depth)
-        z = depth[v, u] + np.maximum(self.config.truncation, self.config.truncation_noise * depth[v, u] ** 2) + 0.05
-        p = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1) @ T[:3, :3].T + T[:3, 3]
-        return np.stack([np.minimum(p.min(0), T[:3, 3]), np.maximum(p.max(0), T[:3, 3])])
-
-    def _fuse(self, depth: np.ndarray, frame: DepthFrame, T: np.ndarray, box: np.ndarray) -> None:
-        config, bricks, camera = self.config, self.bricks, frame.camera
-        intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        stride = max(1, int(0.03 * camera.fx / 2))
-        edge = SIDE * config.voxel
-        found = missing_bricks(bricks.table, bricks.corner, edge, depth, stride, config.truncation_noise, config.truncation, intrinsics, T)
-        bricks.add(found)
-        inverse = np.linalg.inv(T)
-        begin = np.clip(np.floor(box[0] / edge).astype(np.int64) - bricks.corner, 0, bricks.table.shape)
-        end = np.clip(np.floor(box[1] / edge).astype(np.int64) + 1 - bricks.corner, 0, bricks.table.shape)
-        fuse(bricks.table, bricks.corner, bricks._distance, bricks._weight, config.voxel, begin, end, depth,
-             config.truncation_noise, config.truncation, config.max_weight, intrinsics, inverse)
-        begin, end = self.lattice.window(*box)
-        look_through(self.lattice.evidence, self.lattice.corner, self.lattice.spacing, begin, end, depth, intrinsics, inverse)
-
-    def _seeds(self, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        bricks, edge = self.bricks, SIDE * self.config.voxel
-        begin = np.clip(np.floor((lower - SEED_MARGIN) / edge).astype(np.int64) - bricks.corner, 0, bricks.table.shape)
-        end = np.clip(np.floor((upper + SEED_MARGIN) / edge).astype(np.int64) + 1 - bricks.corner, 0, bricks.table.shape)
-        return surface_seeds(bricks.table, bricks.corner, bricks._distance, bricks._weight, self.config.voxel, begin, end)
-
-    def _guess(self, eye: np.ndarray) -> None:
-        lattice = self.lattice
-        up = int(np.abs(self._up).argmax())
-        reach = np.full(3, GUESS_ACROSS)
-        reach[up] = GUESS_ALONG
-        begin, end = lattice.window(eye - reach, eye + reach)
-        end = begin + (end - begin) // STRIDE * STRIDE
-        seeds, _ = self._seeds(eye - reach, eye + reach)
-        if len(seeds) == 0:
-            return
-        part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
-        # The network knows the vertical as the last axis, upwards.
-        order = [a for a in range(3) if a != up] + [up]
-        flip = self._up[up] < 0
-        evidence = lattice.evidence[part].transpose(order)
-        corner, points = (lattice.corner + begin)[order], seeds[:, order].copy()
-        if flip:
-            evidence = evidence[:, :, ::-1]
-            corner[2] = -(corner[2] + evidence.shape[2] - 1)
-            points[:, 2] *= -1
-        x = features(gather(points, np.ascontiguousarray(evidence), corner, lattice.spacing))
-        with torch.no_grad():
-            share, width = (t[0].cpu().numpy() for t in self.network(x[None].to(self.device)))
-        back = np.argsort(order)
-        for name, values in (("share", share), ("width", width)):
-            values = values[:, :, ::-1] if flip else values
-            getattr(lattice, name)[part] = values.transpose(back)
-        lattice.guessed[part] = True
-        low, high = lattice.spacing * (lattice.corner + begin), lattice.spacing * (lattice.corner + end - 1)
-        self._viewed = np.stack([np.minimum(self._viewed[0], low), np.maximum(self._viewed[1], high)])
-
     def refresh(self) -> None:
-        if self._viewed is None:
-            return
-        lattice, bricks, voxel = self.lattice, self.bricks, self.config.voxel
-        begin, end = lattice.window(self._viewed[0], self._viewed[1])
-        seeds, normals = self._seeds(lattice.spacing * (lattice.corner + begin), lattice.spacing * (lattice.corner + end))
-        if len(seeds) == 0:
-            return
-        self._viewed = None
-        step = HALF_RATIO
-        size = (end - begin - 1) * (RATIO // step) + 1
-        places = (seeds / np.float32(step * voxel) - (lattice.corner + begin) * (RATIO // step)).astype(np.float32)
-        nearest, _ = nearest_points(places, tuple(int(s) for s in size), 1)
-        part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
-        lower = gather(seeds, np.ascontiguousarray(lattice.evidence[part]), lattice.corner + begin, lattice.spacing).lower
-        state, gap = np.zeros(lower.shape, np.int8), np.zeros(lower.shape, np.float32)
-        offset = np.zeros(3, np.int64)
-        patch = 0.5 * voxel
-        source = (bricks.table, bricks.corner, bricks._distance, bricks._weight, voxel, lattice.evidence)
-        coarse_values(begin, end, offset, step, nearest, seeds, normals, patch, lower, lattice.corner, lattice.spacing,
-                      *source, lattice.share.astype(np.float32), lattice.width.astype(np.float32), lattice.value, lattice.confidence, state, gap)
-        refine, stale = np.zeros(lower.shape, np.bool_), np.zeros(lower.shape, np.bool_)
-        cells_to_refine(begin, end, offset, step, nearest, seeds, normals, patch, lattice.corner, lattice.spacing,
-                        *source, lattice.value, state, gap, lattice.block, lattice.corrections, refine, stale)
-        block = lattice.block[part]
-        gone = ~refine & (block >= 0)
-        gone[-1], gone[:, -1], gone[:, :, -1] = False, False, False
-        lattice.spare += block[gone].tolist()
-        block[gone] = -1
-        fresh = refine & (block < 0)
-        block[fresh] = lattice.take_blocks(int(fresh.sum()))
-        cells = np.argwhere((block >= 0) & (fresh | stale))
-        self.written = (len(cells), int(refine.sum()))
-        fine_values(cells, block[tuple(cells.T)], begin, offset, step, nearest, seeds, normals, patch, lattice.corner, lattice.spacing,
-                    *source, lattice.value, state, gap, lattice.corrections)
-        self._ready = True
-        self.steps += 1
+        """Bring the distances up to date with all frames so far."""
+        if self._viewed is not None and refresh(self.lattice, self.bricks, self._viewed):
+            self._viewed, self._ready = None, True
+            self.steps += 1
 
     def step(self) -> float:
+        """The same as `refresh`; there is no loss to return, so it is 0."""
+        self.refresh()
         return 0.0
 
+    def run_for(self, cpu_seconds: float) -> int:
+        """Refresh if a frame came in since the last time; returns how often: 0 or 1, for there is no more to gain."""
+        before = self.steps
+        end = time.process_time() + cpu_seconds
+        while self._viewed is not None and self.steps == before and time.process_time() < end:
+            self.refresh()
+        return self.steps - before
+
     def field(self) -> LatticeField:
+        """An immutable snapshot of the distance field, at most `refresh_period` of frame time old.
+
+        Raises:
+            NotReadyError: no frame was integrated yet, or none showed a surface.
+        """
         if not self._ready:
             raise NotReadyError("no surface was seen yet: call mapper.integrate(frame) first")
         lattice = self.lattice
-        return LatticeField(lattice.value.copy(), lattice.confidence.copy(), lattice.block.copy(), lattice.corrections[: lattice.used].copy(),
-                            lattice.corner.copy(), lattice.spacing, self._bounds)
+        return LatticeField(
+            lattice.value.copy(),
+            lattice.confidence.copy(),
+            lattice.block.copy(),
+            lattice.corrections[: lattice.used].copy(),
+            lattice.corner.copy(),
+            lattice.spacing,
+            self._bounds,
+        )
 
     def cost_field(self, eps: float) -> CostField:
+        """The CHOMP collision cost c(f(x)) with reach `eps` [m], over a snapshot of the field."""
         return CostField(self.field(), eps)
 
+    def save(self, path: str | Path) -> None:
+        """Write everything needed to go on mapping to one file, atomically, after a `refresh`."""
+        from . import state
 
-def load_network() -> CompletionNet:
-    from safetensors.torch import load_file
+        state.save(self, Path(path))
 
-    net = CompletionNet()
-    import os
-    path = os.environ.get("NET", str(WEIGHTS))
-    net.load_state_dict({k: v.float() for k, v in load_file(path).items()})
-    return net.eval()
+    @classmethod
+    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Mapper:
+        """Read a map written by `save`."""
+        from . import state
+
+        return state.load(Path(path), device)
+
+    def _usable(self, frame: DepthFrame) -> Float[np.ndarray, "h w"]:
+        depth = frame.depth.numpy()
+        depth = np.where(depth <= self.config.max_depth, depth, np.float32(0))
+        if not depth.any():
+            raise FrameError(
+                f"no pixel of the frame is within max_depth = {self.config.max_depth} m; raise it, or skip this frame"
+            )
+        return depth
+
+    def _repeats(self, depth: Float[np.ndarray, "h w"], when: float) -> bool:
+        """Whether the image is the last one again: a camera that hangs, whatever its pose says."""
+        same = self._last is not None and np.array_equal(depth, self._last)
+        self._last = depth
+        if same and not self._frozen:
+            logger.warning("at %.2f s the depth image repeats the last one: the camera hangs; passed over", when)
+        elif self._frozen and not same:
+            logger.warning("at %.2f s the camera is back", when)
+        self._frozen = same
+        self.frames_skipped += same
+        return same
+
+    def _appeared(
+        self, depth: Float[np.ndarray, "h w"], T: Float[np.ndarray, "4 4"], stride: int, frame: DepthFrame
+    ) -> np.ndarray | None:
+        """Where something stands in space known to be free; None if the frame is to be passed over."""
+        if not self._ready:
+            return np.zeros((-(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), dtype=bool)
+        appeared, contradicted, known = compare(self.lattice.arrays, depth, stride, _intrinsics(frame), T)
+        if known >= JUDGED and contradicted > CONTRADICTED and self._refused < PATIENCE:
+            self._refused += 1
+            self.frames_skipped += 1
+            logger.warning(
+                "at %.2f s %.0f %% of the depth image contradict the map: a jump of the pose? passed over",
+                frame.time,
+                100 * contradicted,
+            )
+            return None
+        self._refused = 0
+        return appeared
+
+    def _view(self, depth: Float[np.ndarray, "h w"], T: Float[np.ndarray, "4 4"], frame: DepthFrame) -> np.ndarray:
+        """Corners (2, 3) [m] of the box that holds the camera and all it sees, to the end of the truncation."""
+        stride = max(1, depth.shape[1] // COLUMNS)
+        v, u = np.nonzero(depth[::stride, ::stride])
+        z = depth[::stride, ::stride][v, u]
+        band = np.maximum(self.config.truncation, self.config.truncation_noise * z * z)
+        # The farthest pixel counts, whatever the stride: it decides whether every brick has a place in the table.
+        z = z + band + 0.1 + (depth.max() - z) * (z == z.max())
+        camera = frame.camera
+        rays = np.stack([(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1)
+        points = (rays * z[:, None]) @ T[:3, :3].T + T[:3, 3]
+        return np.stack([np.minimum(points.min(axis=0), T[:3, 3]), np.maximum(points.max(axis=0), T[:3, 3])])
+
+    def _fuse(
+        self,
+        depth: Float[np.ndarray, "h w"],
+        T: Float[np.ndarray, "4 4"],
+        frame: DepthFrame,
+        box: np.ndarray,
+        appeared: np.ndarray,
+        stride: int,
+    ) -> None:
+        config, bricks, lattice, intrinsics = self.config, self.bricks, self.lattice, _intrinsics(frame)
+        band = (config.truncation_noise, config.truncation)
+        # At the far end of the range neighbouring rays are still closer than half a brick.
+        sparse = max(1, int(4 * config.voxel * frame.camera.fx / config.max_depth))
+        bricks.add(missing_bricks(bricks.arrays, depth, sparse, *band, intrinsics, T))
+        inverse = np.linalg.inv(T)
+        fuse(bricks.arrays, *bricks.box(*box), depth, *band, config.max_weight, intrinsics, inverse)
+        begin, end = lattice.window(*box)
+        look_through(
+            lattice.evidence, lattice.corner, lattice.spacing, begin, end, depth, appeared, stride, intrinsics, inverse
+        )
+
+    def _guess(self, eye: Float[np.ndarray, "3"]) -> None:
+        box = guess(self.lattice, self.bricks, self.network, eye, self.up)
+        if box is not None:
+            self._touch(box)
+
+    def _touch(self, box: np.ndarray) -> None:
+        """Have a box (2, 3) [m] refreshed with the next refresh."""
+        old = box if self._viewed is None else self._viewed
+        self._viewed = np.stack([np.minimum(old[0], box[0]), np.maximum(old[1], box[1])])
+
+
+def _intrinsics(frame: DepthFrame) -> tuple[float, float, float, float]:
+    camera = frame.camera
+    return float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)

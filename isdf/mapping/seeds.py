@@ -5,30 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-
-@njit(cache=True)
-def _voxel(table, corner, distances, weights, i, j, k):  # type: ignore[no-untyped-def]
-    """Distance and weight of the voxel at a lattice index; weight 0 where nothing is stored."""
-    a, b, c = (i >> 3) - corner[0], (j >> 3) - corner[1], (k >> 3) - corner[2]
-    if a < 0 or b < 0 or c < 0 or a >= table.shape[0] or b >= table.shape[1] or c >= table.shape[2]:
-        return 0.0, 0.0
-    brick = table[a, b, c]
-    if brick < 0:
-        return 0.0, 0.0
-    at = (i & 7) * 64 + (j & 7) * 8 + (k & 7)
-    return distances[brick, at], weights[brick, at]
+from .bricks import Bricks, voxel_at
 
 
 @njit(cache=True)
-def surface_seeds(table, corner, distances, weights, voxel, begin, end):  # type: ignore[no-untyped-def]
+def surface_seeds(bricks: Bricks, begin, end):  # type: ignore[no-untyped-def]
     """Zero crossings between observed neighbours, averaged within each voxel, of a box of bricks.
 
     Returns:
-        (n, 3) float32 positions [m] and (n, 3) float32 unit normals, towards where each surface was seen from.
+        float32 positions (n, 3) [m], unit normals (n, 3) towards where each surface was seen from, and weights (n,).
     """
+    table, corner, distances, weights, voxel = bricks
+    # Farther from zero than this no neighbour is across, for distances that change by at most a voxel a voxel or so.
     limit = 1.8 * voxel
     size = 4096
-    points, normals = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
+    points, normals, seen = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32), np.empty(size, np.float32)
     count = 0
     shift, slope = np.empty(3), np.empty(3)
     for bi in range(begin[0], end[0]):
@@ -49,8 +40,8 @@ def surface_seeds(table, corner, distances, weights, voxel, begin, end):  # type
                     for axis in range(3):
                         known = 0
                         for side in (-1, 1):
-                            there, weight = _voxel(
-                                table, corner, distances, weights,
+                            there, weight = voxel_at(
+                                bricks,
                                 i + (side if axis == 0 else 0),
                                 j + (side if axis == 1 else 0),
                                 k + (side if axis == 2 else 0),
@@ -72,11 +63,13 @@ def surface_seeds(table, corner, distances, weights, voxel, begin, end):  # type
                     if count == size:
                         points = np.concatenate((points, np.empty_like(points)))
                         normals = np.concatenate((normals, np.empty_like(normals)))
+                        seen = np.concatenate((seen, np.empty_like(seen)))
                         size *= 2
                     points[count, 0] = voxel * (i + shift[0] / crossings)
                     points[count, 1] = voxel * (j + shift[1] / crossings)
                     points[count, 2] = voxel * (k + shift[2] / crossings)
                     for axis in range(3):
                         normals[count, axis] = slope[axis] / length
+                    seen[count] = weights[brick, at]
                     count += 1
-    return points[:count].copy(), normals[:count].copy()
+    return points[:count].copy(), normals[:count].copy(), seen[:count].copy()
