@@ -1,6 +1,7 @@
 """Depth sequences: a recorded folder to read and write, and readers of the layouts that public data comes in."""
 
 from .detect import open_sequence
+from .polycam import PolycamSequence
 from .recorded import RecordedSequence, SequenceWriter
 from .replica import ReplicaCadSequence, ReplicaSequence
 from .rosbag import RosbagSequence
@@ -11,6 +12,7 @@ from .tum import TumSequence
 
 __all__ = [
     "DepthSequence",
+    "PolycamSequence",
     "RecordedSequence",
     "ReplicaCadSequence",
     "ReplicaSequence",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import DatasetError
+from .polycam import PolycamSequence
 from .recorded import RecordedSequence
 from .replica import ReplicaCadSequence, ReplicaSequence
 from .rosbag import RosbagSequence
@@ -20,6 +21,7 @@ LAYOUTS = (
     ScanNetSequence,
     SevenScenesSequence,
     TumSequence,
+    PolycamSequence,
     RosbagSequence,
 )
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from isdf import DatasetError, FrameError, MapperConfig, PinholeCamera
 from isdf.datasets import (
     DepthSequence,
+    PolycamSequence,
     RecordedSequence,
     ReplicaCadSequence,
     ReplicaSequence,
@@ -110,6 +111,22 @@ def write_tum(folder: Path, start: float = 1305031102.0) -> np.ndarray:
         truth.append(f"{start + t:.6f} " + " ".join(f"{v:.9f}" for v in (*pose[:3, 3], *quaternion)))
     (folder / "groundtruth.txt").write_text("\n".join(truth) + "\n")
     return depths
+
+
+def write_polycam(folder: Path, cameras: str = "corrected_cameras") -> None:
+    """Depth of 16 x 12 beside colour of 64 x 48; a camera that looks along -z with y up; stamps in microseconds."""
+    for i, (depth, pose) in enumerate(zip(make_depths(3), make_poses(3), strict=True)):
+        stamp = 5_000_000 + 500_000 * i
+        save_png(folder / "keyframes" / "depth" / f"{stamp}.png", depth, 1000.0)
+        trust = np.full(depth.shape, 255, dtype=np.uint8)
+        trust[5, 6], trust[5, 7] = 0, 127
+        (folder / "keyframes" / "confidence").mkdir(exist_ok=True)
+        Image.fromarray(trust).save(folder / "keyframes" / "confidence" / f"{stamp}.png")
+        turned = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        values = {f"t_{r}{c}": turned[r, c] for r in range(3) for c in range(4)}
+        values |= {"fx": 80.0 + i, "fy": 84.0, "cx": 31.5, "cy": 21.5, "width": 64, "height": 48}
+        (folder / "keyframes" / cameras).mkdir(exist_ok=True)
+        (folder / "keyframes" / cameras / f"{stamp}.json").write_text(json.dumps(values))
 
 
 def steady_motion(t: float) -> np.ndarray:
@@ -289,6 +306,38 @@ def test_tum_faults_and_images_without_a_pose(tmp_path) -> None:
         TumSequence(tmp_path / "desk", camera=camera)
 
 
+@pytest.mark.parametrize("cameras", ["corrected_cameras", "cameras"])
+def test_polycam_turns_the_camera_and_scales_its_intrinsics(tmp_path, cameras) -> None:
+    write_polycam(tmp_path, cameras)
+    sequence = open_sequence(tmp_path)
+    assert isinstance(sequence, PolycamSequence) and sequence.fps == pytest.approx(2.0)
+    depths = make_depths(3)
+    depths[:, 5, 6] = 0.0  # of low confidence
+    assert_reads(sequence, depths, make_poses(3))
+    assert sequence[1].time == pytest.approx(0.5)
+    # The middle of the colour image's columns is the middle of the depth image's.
+    assert sequence[0].camera == PinholeCamera(20.0, 21.0, 7.5, 5.0, 16, 12)
+    assert sequence[2].camera.fx == pytest.approx(82.0 / 4)
+
+
+def test_polycam_faults_and_depth_out_of_range(tmp_path) -> None:
+    write_polycam(tmp_path)
+    folder = tmp_path / "keyframes"
+    save_png(folder / "depth" / "5000000.png", np.full((12, 16), 5.5), 1000.0)
+    with pytest.raises(FrameError, match="valid"):
+        PolycamSequence(tmp_path)[0]
+    Image.fromarray(np.ones((6, 8), dtype=np.uint8)).save(folder / "confidence" / "5500000.png")
+    with pytest.raises(DatasetError, match=r"confidence/5500000\.png: has shape \(6, 8\)"):
+        PolycamSequence(tmp_path)[1]
+    (folder / "corrected_cameras" / "5000000.json").write_text('{"fx": 80}')
+    with pytest.raises(DatasetError, match=r"5000000\.json: 'fy' missing"):
+        PolycamSequence(tmp_path)
+    for path in (folder / "corrected_cameras").iterdir():
+        path.rename(path.with_name("7" + path.name))
+    with pytest.raises(DatasetError, match="no depth image has the name of a camera file"):
+        PolycamSequence(tmp_path)
+
+
 def test_poses_between_stamps() -> None:
     stamps = np.array([2.0, 0.0, 1.0, 1.0, 3.0])
     poses = np.stack([steady_motion(t) for t in stamps])
@@ -324,6 +373,7 @@ def test_an_unknown_folder_is_told_what_every_layout_misses(tmp_path) -> None:
         "ScanNet export: depth/<n>.png, pose/<n>.txt, intrinsic/intrinsic_depth.txt;",
         "7-Scenes: frame-%06d.depth.png",
         "TUM RGB-D: depth.txt, groundtruth.txt;",
+        "Polycam raw data: keyframes/depth/<t>.png, keyframes/corrected_cameras/<t>.json",
         "ROS bag: ",
     ):
         assert part in text
