@@ -29,3 +29,7 @@ class CheckpointError(IsdfError):
 
 class NotReadyError(IsdfError):
     """The map was asked for something it can only give after a first frame."""
+
+
+class EvaluationError(IsdfError):
+    """A map cannot be judged: its answers are not numbers, or there is nothing to judge it by."""

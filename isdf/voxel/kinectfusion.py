@@ -6,16 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
-from torch import Tensor
 
 from ..errors import ConfigError
-from ..field import GridField, check_points
 from ..frames import DepthFrame
 from .mapper import VoxelMapper, check_period
-from .nearest_seed import observed_at
 from .volume import GrowingVolume, usable_depth
+from .voxel_field import VoxelField
 
 # Bounds of the evidence of a voxel, in log odds: few contrary measurements can turn it.
 LOG_ODDS_LIMITS = (-2.0, 3.5)
@@ -55,41 +52,6 @@ class KinectFusionConfig:
         check_period(self.rebuild_period)
 
 
-class OccupancyField:
-    """Trilinear distances of an occupancy grid, and what of it was observed; immutable.
-
-    Args:
-        grid: distances at the voxel centres.
-        observed: of the same shape.
-        bounds: (2, 3) lower and upper corner of what was observed [m].
-    """
-
-    def __init__(
-        self, grid: GridField, observed: Bool[Tensor, "nx ny nz"], bounds: Float[Tensor, "2 3"]
-    ) -> None:
-        self._grid, self._observed, self.bounds = grid, observed, bounds.clone()
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the grids [bytes]."""
-        return self._grid.values.nbytes + self._grid._volume.nbytes + self._observed.nbytes
-
-    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Signed distance [m] at world points [m], positive outside; differentiable by autograd."""
-        return self._grid.distance(points)
-
-    def distance_and_gradient(
-        self, points: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Signed distance [m] and the gradient of its interpolant; no autograd graph."""
-        return self._grid.distance_and_gradient(points)
-
-    def confidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """1 where the voxel of a world point [m] was observed, 0 elsewhere."""
-        check_points(points)
-        return observed_at(self._observed, self._grid.origin, self._grid.spacing, points)
-
-
 class KinectFusionMapper(VoxelMapper):
     """Occupancy grid, then the distance to the occupied minus the distance to the free voxels (paper, appendix).
 
@@ -105,14 +67,17 @@ class KinectFusionMapper(VoxelMapper):
 
     def __init__(self, config: KinectFusionConfig | None = None) -> None:
         config = config or KinectFusionConfig()
-        super().__init__(config, GrowingVolume(config.voxel, ("log_odds", "observed"), config.max_voxels))
+        super().__init__(
+            config,
+            GrowingVolume(config.voxel, {"log_odds": np.float32, "observed": np.float32}, config.max_voxels),
+        )
 
     @classmethod
     def config_type(cls) -> type:
         """`KinectFusionConfig`."""
         return KinectFusionConfig
 
-    def field(self) -> OccupancyField:
+    def field(self) -> VoxelField:
         """An immutable snapshot of the distance field, at most `rebuild_period` of frame time old.
 
         Raises:
@@ -134,11 +99,15 @@ class KinectFusionMapper(VoxelMapper):
             log_odds[index] = np.clip(log_odds[index] + evidence, *LOG_ODDS_LIMITS)
             observed[index] = 1
 
-    def _rebuild(self) -> OccupancyField | None:
+    def _rebuild(self) -> VoxelField | None:
         occupied = self.volume.channels["log_odds"] > 0
         if not occupied.any():
             return None
         voxels = distance_transform_edt(~occupied) - distance_transform_edt(occupied)
-        values = torch.from_numpy((voxels * self.volume.voxel).astype(np.float32))
-        grid = GridField(values, torch.from_numpy(self.volume.origin.astype(np.float32)), self.volume.voxel)
-        return OccupancyField(grid, torch.from_numpy(self.volume.channels["observed"] > 0), self._bounds)
+        return VoxelField(
+            torch.from_numpy((voxels * self.volume.voxel).astype(np.float32)),
+            torch.from_numpy(self.volume.channels["observed"] > 0),
+            torch.from_numpy(self.volume.origin.astype(np.float32)),
+            self.volume.voxel,
+            self._bounds,
+        )

@@ -63,7 +63,7 @@ class TsdfVolume(GrowingVolume):
     """
 
     def __init__(self, config: TsdfConfig) -> None:
-        super().__init__(config.voxel, ("distance", "weight"), config.max_voxels)
+        super().__init__(config.voxel, {"distance": np.float32, "weight": np.float32}, config.max_voxels)
         self.config = config
 
     @property

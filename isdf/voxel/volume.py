@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -34,27 +34,27 @@ class Sight(NamedTuple):
 
 
 class GrowingVolume:
-    """Named float32 channels over one box of voxels, whose lattice is fixed to the world's origin.
+    """Named channels over one box of voxels, whose lattice is fixed to the world's origin.
 
     Voxel (i, j, k) of the lattice has its centre at voxel * (i, j, k) [m]; array index 0 is lattice index `corner`.
 
     Args:
         voxel: edge of a voxel [m].
-        channels: names; all start at zero.
+        channels: names and types; all start at zero.
         max_voxels: growth beyond this many is refused.
 
     Raises:
         ConfigError: the voxel size or the limit is not positive.
     """
 
-    def __init__(self, voxel: float, channels: tuple[str, ...], max_voxels: int) -> None:
+    def __init__(self, voxel: float, channels: Mapping[str, type[np.generic]], max_voxels: int) -> None:
         if not (np.isfinite(voxel) and voxel > 0) or max_voxels < 1:
             raise ConfigError(
                 f"voxel must be a positive edge in metres and max_voxels positive, got {voxel} and {max_voxels}"
             )
         self.voxel, self.max_voxels = float(voxel), int(max_voxels)
         self.corner = np.zeros(3, dtype=np.int64)
-        self.channels = {name: np.zeros((0, 0, 0), dtype=np.float32) for name in channels}
+        self.channels = {name: np.zeros((0, 0, 0), dtype=kind) for name, kind in channels.items()}
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -94,7 +94,7 @@ class GrowingVolume:
         offset = self.corner - first
         inner = tuple(slice(o, o + n) for o, n in zip(offset, self.shape, strict=True))
         for name, old in self.channels.items():
-            new = np.zeros(tuple(size), dtype=np.float32)
+            new = np.zeros(tuple(size), dtype=old.dtype)
             if old.size:
                 new[inner] = old
             self.channels[name] = new
