@@ -85,7 +85,9 @@ class Train:
             chosen = [f for f in rng.choice(files, self.batch) if int(f.name[:5]) % 50]
             if not chosen:
                 continue
-            x, truth, mask = (torch.stack(t) for t in zip(*[turned(load(f), rng) for f in chosen], strict=True))
+            x, truth, mask = (
+                torch.stack(t) for t in zip(*[turned(load(f), rng) for f in chosen], strict=True)
+            )
             loss, error, _ = score(net, x, truth, mask)
             optimiser.zero_grad()
             loss.backward()
@@ -95,7 +97,10 @@ class Train:
             step += 1
             if step % 100 == 0:
                 held = self.validate(net, [f for f in files if int(f.name[:5]) % 50 == 0])
-                print(f"step {step} of {len(files)} windows: error {100 * running:.1f} cm; held out {held}", flush=True)
+                print(
+                    f"step {step} of {len(files)} windows: error {100 * running:.1f} cm; held out {held}",
+                    flush=True,
+                )
                 self.out.parent.mkdir(parents=True, exist_ok=True)
                 save_file({k: v.half() for k, v in net.state_dict().items()}, self.out)
 
@@ -109,7 +114,12 @@ class Train:
                 for state in (3, 2):
                     here = mask & (x[:, state] > 0) & (truth > 0)
                     upper = x[:, 0][here]
-                    rows.append([float((upper - truth[here]).abs().mean()), float((f[here] - truth[here]).abs().mean())])
+                    rows.append(
+                        [
+                            float((upper - truth[here]).abs().mean()),
+                            float((f[here] - truth[here]).abs().mean()),
+                        ]
+                    )
         table = 100 * np.nanmean(np.array(rows).reshape(-1, 4), axis=0)
         return "unseen {:.1f} -> {:.1f}, seen {:.2f} -> {:.2f}".format(*table)
 
@@ -189,13 +199,20 @@ def seen(depth: np.ndarray, T: np.ndarray, camera: tuple[float, ...], rng: np.ra
     steps = [(0.0, 0.0)]
     right = np.roll(depth, -1, 1)[v, u]
     below = np.roll(depth, -1, 0)[v, u]
-    smooth = (np.abs(right - z) < 0.15 * z) & (np.abs(below - z) < 0.15 * z) & (u < IMAGE[1] - 1) & (v < IMAGE[0] - 1)
+    smooth = (
+        (np.abs(right - z) < 0.15 * z)
+        & (np.abs(below - z) < 0.15 * z)
+        & (u < IMAGE[1] - 1)
+        & (v < IMAGE[0] - 1)
+    )
     out = []
     # Fused surfaces have a point every 4 cm; fill in between pixels where the depth is smooth.
     for a, b in [*steps, (0.5, 0.0), (0.0, 0.5), (0.5, 0.5)]:
         keep = smooth | (a == b == 0)
         d = z + a * (right - z) + b * (below - z)
-        p = np.stack([(u + a - camera[2]) / camera[0] * d, (v + b - camera[3]) / camera[1] * d, d], axis=1)[keep]
+        p = np.stack([(u + a - camera[2]) / camera[0] * d, (v + b - camera[3]) / camera[1] * d, d], axis=1)[
+            keep
+        ]
         out.append(p @ T[:3, :3].T + T[:3, 3])
     points = np.concatenate(out)
     return (points + rng.normal(0, 0.004, points.shape)).astype(np.float32)

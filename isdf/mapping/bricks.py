@@ -114,9 +114,11 @@ class BrickVolume:
         self.table[tuple(places.T)] = np.arange(self.count, self.count + len(places))
         self.count += len(places)
 
-
     def restore(
-        self, table: Int[np.ndarray, "nx ny nz"], distance: Float[np.ndarray, "n 512"], weight: Float[np.ndarray, "n 512"]
+        self,
+        table: Int[np.ndarray, "nx ny nz"],
+        distance: Float[np.ndarray, "n 512"],
+        weight: Float[np.ndarray, "n 512"],
     ) -> None:
         """Take over the bricks of another volume.
 
@@ -124,14 +126,18 @@ class BrickVolume:
             FrameError: the arrays do not fit each other.
         """
         if table.ndim != 3 or distance.shape != weight.shape or distance.shape[1:] != (VOXELS,):
-            raise FrameError(f"bricks of shapes {table.shape}, {distance.shape} and {weight.shape} do not fit")
+            raise FrameError(
+                f"bricks of shapes {table.shape}, {distance.shape} and {weight.shape} do not fit"
+            )
         if table.max(initial=-1) >= len(distance) or table.min(initial=-1) < -1:
             raise FrameError(f"a table of bricks up to {table.max()} does not fit {len(distance)} bricks")
         self.table, self.count = table.astype(np.int32), len(distance)
         self._distance, self._weight = distance.astype(np.float32), weight.astype(np.float32)
 
 
-def moved(old: np.ndarray, corner: np.ndarray, first: np.ndarray, size: np.ndarray, empty: float) -> np.ndarray:
+def moved(
+    old: np.ndarray, corner: np.ndarray, first: np.ndarray, size: np.ndarray, empty: float
+) -> np.ndarray:
     """A lattice array in a larger box: entry 0 was at lattice index `corner` and is at `first` now."""
     new = np.full(tuple(size), empty, dtype=old.dtype)
     if old.size:

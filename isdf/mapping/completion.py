@@ -53,7 +53,9 @@ class CompletionNet(nn.Module):
         self.up1 = conv(48 + 24, 24)
         self.lift = nn.Conv3d(24, 24, 1)
         self.local = nn.Conv3d(CHANNELS, 24, 1)
-        self.head = nn.Sequential(nn.LeakyReLU(0.1), nn.Conv3d(24, 24, 1), nn.LeakyReLU(0.1), nn.Conv3d(24, 2, 1))
+        self.head = nn.Sequential(
+            nn.LeakyReLU(0.1), nn.Conv3d(24, 24, 1), nn.LeakyReLU(0.1), nn.Conv3d(24, 2, 1)
+        )
 
     def forward(
         self, x: Float[Tensor, "b 8 nx ny nz"]

@@ -120,7 +120,12 @@ def gather(
     floor = np.partition(seeds[:, 2], len(seeds) // 50)[len(seeds) // 50]
     height = spacing * (corner[2] + np.arange(shape[2])) - floor
     return Evidence(
-        upper * np.float32(spacing), lower * np.float32(spacing), free, unknown, direction, height.astype(np.float32)
+        upper * np.float32(spacing),
+        lower * np.float32(spacing),
+        free,
+        unknown,
+        direction,
+        height.astype(np.float32),
     )
 
 

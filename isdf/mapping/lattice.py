@@ -101,7 +101,10 @@ class Lattice:
         return np.clip(begin, 0, shape), np.clip(end, 0, shape)
 
     def reassign(
-        self, block: Int[np.ndarray, "mx my mz"], wanted: Bool[np.ndarray, "mx my mz"], unwanted: Bool[np.ndarray, "mx my mz"]
+        self,
+        block: Int[np.ndarray, "mx my mz"],
+        wanted: Bool[np.ndarray, "mx my mz"],
+        unwanted: Bool[np.ndarray, "mx my mz"],
     ) -> Bool[np.ndarray, "mx my mz"]:
         """Give blocks of corrections to wanted cells that have none and take those of unwanted ones.
 
@@ -131,5 +134,11 @@ class Lattice:
     def arrays(self) -> LatticeArrays:
         """For compiled code."""
         return LatticeArrays(
-            self.corner * self.spacing, self.spacing, self.value, self.confidence, self.block, self.corrections, self.evidence
+            self.corner * self.spacing,
+            self.spacing,
+            self.value,
+            self.confidence,
+            self.block,
+            self.corrections,
+            self.evidence,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import time
@@ -14,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..camera import PinholeCamera
 from ..cost import CostField
 from ..errors import ConfigError, FrameError, NotReadyError
 from ..extent import grown, nothing_seen
@@ -92,8 +94,11 @@ class Mapper:
     """
 
     def __init__(self, config: MapperConfig | None = None, device: str | torch.device = "cpu") -> None:
-        self.config = config or MapperConfig()
-        self.device = torch.device(device)
+        compile_kernels()
+        self._begin(config or MapperConfig(), torch.device(device))
+
+    def _begin(self, config: MapperConfig, device: torch.device) -> None:
+        self.config, self.device = config, device
         self.bricks = BrickVolume(self.config.voxel, self.config.max_bricks)
         self.lattice = Lattice(RATIO * self.config.voxel)
         self.network = load_network().to(self.device)
@@ -223,7 +228,9 @@ class Mapper:
         same = self._last is not None and np.array_equal(depth, self._last)
         self._last = depth
         if same and not self._frozen:
-            logger.warning("at %.2f s the depth image repeats the last one: the camera hangs; passed over", when)
+            logger.warning(
+                "at %.2f s the depth image repeats the last one: the camera hangs; passed over", when
+            )
         elif self._frozen and not same:
             logger.warning("at %.2f s the camera is back", when)
         self._frozen = same
@@ -249,7 +256,9 @@ class Mapper:
         self._refused = 0
         return appeared
 
-    def _view(self, depth: Float[np.ndarray, "h w"], T: Float[np.ndarray, "4 4"], frame: DepthFrame) -> np.ndarray:
+    def _view(
+        self, depth: Float[np.ndarray, "h w"], T: Float[np.ndarray, "4 4"], frame: DepthFrame
+    ) -> np.ndarray:
         """Corners (2, 3) [m] of the box that holds the camera and all it sees, to the end of the truncation."""
         stride = max(1, depth.shape[1] // COLUMNS)
         v, u = np.nonzero(depth[::stride, ::stride])
@@ -258,7 +267,9 @@ class Mapper:
         # The farthest pixel counts, whatever the stride: it decides whether every brick has a place in the table.
         z = z + band + 0.1 + (depth.max() - z) * (z == z.max())
         camera = frame.camera
-        rays = np.stack([(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1)
+        rays = np.stack(
+            [(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1
+        )
         points = (rays * z[:, None]) @ T[:3, :3].T + T[:3, 3]
         return np.stack([np.minimum(points.min(axis=0), T[:3, 3]), np.maximum(points.max(axis=0), T[:3, 3])])
 
@@ -280,7 +291,16 @@ class Mapper:
         fuse(bricks.arrays, *bricks.box(*box), depth, *band, config.max_weight, intrinsics, inverse)
         begin, end = lattice.window(*box)
         look_through(
-            lattice.evidence, lattice.corner, lattice.spacing, begin, end, depth, appeared, stride, intrinsics, inverse
+            lattice.evidence,
+            lattice.corner,
+            lattice.spacing,
+            begin,
+            end,
+            depth,
+            appeared,
+            stride,
+            intrinsics,
+            inverse,
         )
 
     def _guess(self, eye: Float[np.ndarray, "3"]) -> None:
@@ -292,6 +312,22 @@ class Mapper:
         """Have a box (2, 3) [m] refreshed with the next refresh."""
         old = box if self._viewed is None else self._viewed
         self._viewed = np.stack([np.minimum(old[0], box[0]), np.maximum(old[1], box[1])])
+
+
+@functools.cache
+def compile_kernels() -> None:
+    """Compile everything that runs later, so that no frame waits for it."""
+    camera = PinholeCamera(12.0, 12.0, 7.5, 5.5, 16, 12)
+    mapper = object.__new__(Mapper)
+    mapper._begin(MapperConfig(), torch.device("cpu"))
+    for index in range(2):
+        depth = torch.full((12, 16), 1.0 + 0.01 * index)
+        depth[4:8, 4:8] -= 0.3
+        mapper.integrate(DepthFrame(depth, torch.eye(4), camera, time=float(2 * index)))
+    field = mapper.field()
+    for dtype in (torch.float32, torch.float64):
+        field.distance_and_gradient(torch.zeros(1, 3, dtype=dtype))
+        field.confidence(torch.zeros(1, 3, dtype=dtype))
 
 
 def _intrinsics(frame: DepthFrame) -> tuple[float, float, float, float]:

@@ -26,7 +26,11 @@ Box = Float[np.ndarray, "2 3"]
 
 
 def guess(
-    lattice: Lattice, bricks: BrickVolume, network: CompletionNet, eye: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
+    lattice: Lattice,
+    bricks: BrickVolume,
+    network: CompletionNet,
+    eye: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"],
 ) -> Box | None:
     """Run the network in a box about the camera and keep its answers in the lattice.
 
@@ -51,7 +55,11 @@ def guess(
     part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
     # The network knows the vertical as the last axis, upwards.
     order = [axis for axis in range(3) if axis != vertical] + [vertical]
-    evidence, corner, seeds = lattice.evidence[part].transpose(order), (lattice.corner + begin)[order], seeds[:, order]
+    evidence, corner, seeds = (
+        lattice.evidence[part].transpose(order),
+        (lattice.corner + begin)[order],
+        seeds[:, order],
+    )
     upside_down = up[vertical] < 0
     if upside_down:
         evidence, seeds = evidence[:, :, ::-1], seeds * np.array([1, 1, -1], dtype=np.float32)
@@ -85,7 +93,9 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     nearest, _ = nearest_points(places, size, 1)
     patches = Patches(centre, normal, weight, PATCH * bricks.voxel, nearest)
     part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
-    proven = gather(centre, np.ascontiguousarray(lattice.evidence[part]), lattice.corner + begin, lattice.spacing)
+    proven = gather(
+        centre, np.ascontiguousarray(lattice.evidence[part]), lattice.corner + begin, lattice.spacing
+    )
     window = Window(
         first=lattice.corner + begin,
         ratio=ratio,

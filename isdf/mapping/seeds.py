@@ -19,7 +19,11 @@ def surface_seeds(bricks: Bricks, begin, end):  # type: ignore[no-untyped-def]
     # Farther from zero than this no neighbour is across, for distances that change by at most a voxel a voxel or so.
     limit = 1.8 * voxel
     size = 4096
-    points, normals, seen = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32), np.empty(size, np.float32)
+    points, normals, seen = (
+        np.empty((size, 3), np.float32),
+        np.empty((size, 3), np.float32),
+        np.empty(size, np.float32),
+    )
     count = 0
     shift, slope = np.empty(3), np.empty(3)
     for bi in range(begin[0], end[0]):

@@ -68,7 +68,9 @@ def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
     try:
         return _restored(tensors, header, device)
     except (KeyError, TypeError, IndexError, RuntimeError, AttributeError, ValueError, IsdfError) as error:
-        raise CheckpointError(f"{path}: the map is incomplete or inconsistent ({error}); map again") from error
+        raise CheckpointError(
+            f"{path}: the map is incomplete or inconsistent ({error}); map again"
+        ) from error
 
 
 def _restored(tensors: dict[str, Tensor], header: dict[str, Any], device: str | torch.device) -> Mapper:
@@ -84,8 +86,14 @@ def _restored(tensors: dict[str, Tensor], header: dict[str, Any], device: str | 
             raise CheckpointError(f"{name} is {values.dtype} {values.shape}, which does not fit the lattice")
         setattr(lattice, name, values)
     corrections = arrays["lattice.corrections"]
-    if corrections.dtype != np.int8 or corrections.shape[1:] != (BLOCK,) or lattice.block.max() >= len(corrections):
-        raise CheckpointError(f"corrections are {corrections.dtype} {corrections.shape}, which does not fit the cells")
+    if (
+        corrections.dtype != np.int8
+        or corrections.shape[1:] != (BLOCK,)
+        or lattice.block.max() >= len(corrections)
+    ):
+        raise CheckpointError(
+            f"corrections are {corrections.dtype} {corrections.shape}, which does not fit the cells"
+        )
     lattice.corrections, lattice.used = corrections, len(corrections)
     held = np.zeros(len(corrections), dtype=bool)
     held[lattice.block[lattice.block >= 0]] = True
