@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
@@ -16,7 +17,7 @@ KINDS = {"box": 0, "cylinder": 1, "sphere": 2}
 
 @dataclass(frozen=True)
 class RandomRoom:
-    """A room's solids as arrays: kind, rotation (3, 3) world to body, centre (3,), parameters (3,); and its free box."""
+    """A room's solids as arrays: kind, rotation (3, 3) world to body, centre (3,), parameters (3,)."""
 
     kind: np.ndarray
     rotation: np.ndarray
@@ -103,7 +104,7 @@ def place(
             return
 
 
-def clutter(rng, name, x, y, yaw, width, depth, top) -> list[Primitive]:  # type: ignore[no-untyped-def]
+def clutter(rng, name, x, y, yaw, width, depth, top) -> list[Primitive]:
     """A few small boxes on top of a piece."""
     if top > 1.2 or rng.random() < 0.4:
         return []
@@ -147,7 +148,8 @@ def piece(rng: np.random.Generator, name: str) -> tuple[fn.Parts, float, float, 
 
 
 @njit(cache=True)
-def solid_distance(kind, p, x, y, z):  # type: ignore[no-untyped-def]
+@no_type_check
+def solid_distance(kind, p, x, y, z):
     """Signed distance of one solid at a point in its own frame."""
     if kind == 0:
         a, b, c = abs(x) - p[0], abs(y) - p[1], abs(z) - p[2]
@@ -160,7 +162,8 @@ def solid_distance(kind, p, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def scene_distance(kinds, rotation, centre, parameters, points):  # type: ignore[no-untyped-def]
+@no_type_check
+def scene_distance(kinds, rotation, centre, parameters, points):
     """Signed distance (n,) to the union of all solids at points (n, 3)."""
     out = np.full(len(points), 1e9)
     for n in range(len(points)):
@@ -175,7 +178,8 @@ def scene_distance(kinds, rotation, centre, parameters, points):  # type: ignore
 
 
 @njit(cache=True)
-def depth_image(kinds, rotation, centre, parameters, T, intrinsics, height, width, near, far):  # type: ignore[no-untyped-def]
+@no_type_check
+def depth_image(kinds, rotation, centre, parameters, T, intrinsics, height, width, near, far):
     """z-depth image (height, width) by sphere tracing; 0 where nothing lies between near and far [m]."""
     fx, fy, cx, cy = intrinsics
     depth = np.zeros((height, width), dtype=np.float32)

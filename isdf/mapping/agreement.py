@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 from numba import njit
 
@@ -9,13 +11,14 @@ from .field import query_one
 from .lattice import LatticeArrays
 
 # A measured point this far in front of all surfaces [m], plus so much times its squared depth, is a contradiction.
-CLEAR, CLEAR_NOISE = 0.10, 0.02
+CLEAR, CLEAR_NOISE = 0.09, 0.015
 # Confidence (255 is 1) above which the map is believed.
-SURE = 200
+SURE = 150
 
 
 @njit(cache=True)
-def compare(lattice: LatticeArrays, depth, stride, intrinsics, T_world_camera):  # type: ignore[no-untyped-def]
+@no_type_check
+def compare(lattice: LatticeArrays, depth, stride, intrinsics, T_world_camera):
     """Look up every `stride`-th measured point, and a point before it that ought to be free, in the map.
 
     Args:

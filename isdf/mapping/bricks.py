@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -136,7 +136,7 @@ class BrickVolume:
 
 
 def moved(
-    old: np.ndarray, corner: np.ndarray, first: np.ndarray, size: np.ndarray, empty: float
+    old: np.ndarray, corner: np.ndarray, first: np.ndarray, size: np.ndarray, empty: float | int
 ) -> np.ndarray:
     """A lattice array in a larger box: entry 0 was at lattice index `corner` and is at `first` now."""
     new = np.full(tuple(size), empty, dtype=old.dtype)
@@ -147,7 +147,8 @@ def moved(
 
 
 @njit(cache=True)
-def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[float, float]:
+@no_type_check
+def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[np.float32, np.float32]:
     """Distance [m] and weight of the voxel at a lattice index; 0 and 0 where nothing is stored."""
     table, corner = bricks.table, bricks.corner
     a, b, c = (i >> 3) - corner[0], (j >> 3) - corner[1], (k >> 3) - corner[2]
@@ -161,7 +162,8 @@ def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def missing_bricks(bricks: Bricks, depth, stride, noise, least, intrinsics, T_world_camera):  # type: ignore[no-untyped-def]
+@no_type_check
+def missing_bricks(bricks: Bricks, depth, stride, noise, least, intrinsics, T_world_camera):
     """Array indices (n, 3) of the bricks that surfaces of a depth image need and the table lacks.
 
     Args:

@@ -8,6 +8,7 @@ was not looked at. Where the two meet the distance is known; between them it has
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -28,7 +29,8 @@ INSIDE = 0.6
 
 
 @njit(cache=True)
-def look_through(free, corner, spacing, begin, end, depth, appeared, stride, intrinsics, T_camera_world):  # type: ignore[no-untyped-def]
+@no_type_check
+def look_through(free, corner, spacing, begin, end, depth, appeared, stride, intrinsics, T_camera_world):
     """Mark the nodes of a box that a depth image looks through.
 
     Args:
@@ -144,7 +146,8 @@ def _lower(free: np.ndarray, unknown: np.ndarray, upper: np.ndarray) -> np.ndarr
 
 
 @njit(cache=True)
-def _beside(these, those):  # type: ignore[no-untyped-def]
+@no_type_check
+def _beside(these, those):
     """Which of these nodes have one of those among their 26 neighbours."""
     nx, ny, nz = these.shape
     out = np.zeros(these.shape, dtype=np.bool_)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import torch
@@ -101,12 +101,12 @@ class LatticeField:
             return
         parts = zip(*(np.array_split(a, threads) for a in (points, distance, gradient)), strict=True)
         with ThreadPoolExecutor(threads) as pool:
-            for done in [pool.submit(kernel, p, *state, d, g) for p, d, g in parts]:
-                done.result()
+            list(pool.map(lambda part: kernel(part[0], *state, *part[1:]), parts))
 
 
 @njit(cache=True, nogil=True)
-def _query(points, origin, spacing, value, block, corrections, distance, gradient):  # type: ignore[no-untyped-def]
+@no_type_check
+def _query(points, origin, spacing, value, block, corrections, distance, gradient):
     """Distances (n,) and gradients (n, 3) of points (n, 3), written in place."""
     nx, ny, nz = value.shape
     parts = FINE - 1
@@ -151,7 +151,8 @@ def _query(points, origin, spacing, value, block, corrections, distance, gradien
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _trilinear(v000, v001, v010, v011, v100, v101, v110, v111, x, y, z):  # type: ignore[no-untyped-def]
+@no_type_check
+def _trilinear(v000, v001, v010, v011, v100, v101, v110, v111, x, y, z):
     """Value of trilinear interpolation at (x, y, z) in [0, 1]^3 and its three derivatives."""
     a00, a01, a10, a11 = v001 - v000, v011 - v010, v101 - v100, v111 - v110
     e00, e01, e10, e11 = v000 + a00 * z, v010 + a01 * z, v100 + a10 * z, v110 + a11 * z
@@ -162,7 +163,8 @@ def _trilinear(v000, v001, v010, v011, v100, v101, v110, v111, x, y, z):  # type
 
 
 @njit(cache=True, nogil=True)
-def _confidence(points, origin, spacing, confidence, out):  # type: ignore[no-untyped-def]
+@no_type_check
+def _confidence(points, origin, spacing, confidence, out):
     """Trilinear confidences (n,) of points (n, 3), 0 outside the lattice and where a point is not finite."""
     nx, ny, nz = confidence.shape
     for n in range(points.shape[0]):
@@ -184,19 +186,22 @@ def _confidence(points, origin, spacing, confidence, out):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def query_one(lattice: LatticeArrays, point):  # type: ignore[no-untyped-def]
-    """Distance [m] and confidence (0 .. 255) at the node closest to a point (3,), and whether it was looked through."""
-    at = np.empty(3, dtype=np.int64)
+@no_type_check
+def query_one(lattice: LatticeArrays, point):
+    """Distance [m] at a point (3,) by the coarse nodes; confidence (0 .. 255) and looked through of the closest."""
+    at, t = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.float32)
     for axis in range(3):
-        at[axis] = int(np.floor((point[axis] - lattice.origin[axis]) / lattice.spacing + 0.5))
-        if at[axis] < 0 or at[axis] >= lattice.value.shape[axis]:
+        place = (point[axis] - lattice.origin[axis]) / lattice.spacing
+        if not 0 <= place < lattice.value.shape[axis] - 1:
             return np.float32(0), 0, False
+        at[axis] = int(place)
+        t[axis] = place - at[axis]
     i, j, k = at
-    value = lattice.value[i, j, k]
-    # Distances change by no more than the way between node and point.
-    way = 0.0
-    for axis in range(3):
-        way += (point[axis] - lattice.origin[axis] - lattice.spacing * at[axis]) ** 2
-    way = np.sqrt(way)
-    value = value - np.float32(way) if value > 0 else value + np.float32(way)
+    v = lattice.value
+    value, _, _, _ = _trilinear(
+        v[i, j, k], v[i, j, k + 1], v[i, j + 1, k], v[i, j + 1, k + 1],
+        v[i + 1, j, k], v[i + 1, j, k + 1], v[i + 1, j + 1, k], v[i + 1, j + 1, k + 1],
+        t[0], t[1], t[2],
+    )  # fmt: skip
+    i, j, k = i + int(t[0] > 0.5), j + int(t[1] > 0.5), k + int(t[2] > 0.5)
     return value, int(lattice.confidence[i, j, k]), lattice.evidence[i, j, k] > 127

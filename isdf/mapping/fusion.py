@@ -6,6 +6,8 @@ that evidence which a view contradicts loses its weight at once, so that moved t
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 from numba import njit
 
@@ -18,7 +20,8 @@ TRUST = 8.0
 
 
 @njit(cache=True)
-def fuse(bricks: Bricks, begin, end, depth, noise, least, max_weight, intrinsics, T_camera_world):  # type: ignore[no-untyped-def]
+@no_type_check
+def fuse(bricks: Bricks, begin, end, depth, noise, least, max_weight, intrinsics, T_camera_world):
     """Average one depth image into the stored voxels of a box of bricks, in place.
 
     Args:

@@ -41,7 +41,7 @@ class LatticeArrays(NamedTuple):
 
 
 class Lattice:
-    """Distances and expected errors at coarse nodes, corrections in refined cells; nothing here depends on how they came.
+    """Distances and expected errors at coarse nodes, corrections in refined cells.
 
     Node n of the coarse lattice lies at spacing * n [m]. A cell is refined when `block` of its lowest node is not -1:
     then 5 x 5 x 5 fine nodes hold what trilinear interpolation of the corners misses, in steps.

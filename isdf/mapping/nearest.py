@@ -1,10 +1,12 @@
 """Nearest surface points of all nodes of a lattice, by sweeping candidates from neighbour to neighbour.
 
 A vector distance transform (Danielsson, 1980) whose vectors end at the surface points themselves, not at lattice
-nodes: distances are exact wherever the candidate is, and the candidate is the nearest point or one a millimetre farther.
+nodes: distances are exact wherever the candidate is, and the candidate is the nearest point or one hardly farther.
 """
 
 from __future__ import annotations
+
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,6 +14,7 @@ from numba import njit
 
 
 @njit(cache=True)
+@no_type_check
 def nearest_points(
     points: Float[np.ndarray, "n 3"], shape: tuple[int, int, int], rounds: int
 ) -> tuple[Int[np.ndarray, "nx ny nz"], Float[np.ndarray, "nx ny nz"]]:
@@ -48,7 +51,8 @@ def nearest_points(
 
 
 @njit(cache=True)
-def _sweep(points, best, square, direction):  # type: ignore[no-untyped-def]
+@no_type_check
+def _sweep(points, best, square, direction):
     """One raster pass: each node tries the points of the 13 neighbours that were passed before it."""
     nx, ny, nz = best.shape
     for a in range(nx):
@@ -68,7 +72,7 @@ def _sweep(points, best, square, direction):  # type: ignore[no-untyped-def]
                     if ii < 0 or ii >= nx or jj < 0 or jj >= ny or kk < 0 or kk >= nz:
                         continue
                     n = best[ii, jj, kk]
-                    if n == mine or n == tried or n < 0:
+                    if n in (mine, tried) or n < 0:
                         continue
                     tried = n
                     d = (points[n, 0] - i) ** 2 + (points[n, 1] - j) ** 2 + (points[n, 2] - k) ** 2

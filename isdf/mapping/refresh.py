@@ -88,9 +88,9 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     ratio = round(lattice.spacing / bricks.voxel)
     # Nearest seeds are found for every second fine node; the others choose among those around them.
     half = ratio // 2
-    size = tuple(int(n) for n in (end - begin - 1) * half + 1)
+    nx, ny, nz = ((end - begin - 1) * half + 1).tolist()
     places = (centre / np.float32(2 * bricks.voxel) - (lattice.corner + begin) * half).astype(np.float32)
-    nearest, _ = nearest_points(places, size, 1)
+    nearest, _ = nearest_points(places, (nx, ny, nz), 1)
     patches = Patches(centre, normal, weight, PATCH * bricks.voxel, nearest)
     part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
     proven = gather(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 from numba import njit
 
@@ -9,7 +11,8 @@ from .bricks import Bricks, voxel_at
 
 
 @njit(cache=True)
-def surface_seeds(bricks: Bricks, begin, end):  # type: ignore[no-untyped-def]
+@no_type_check
+def surface_seeds(bricks: Bricks, begin, end):
     """Zero crossings between observed neighbours, averaged within each voxel, of a box of bricks.
 
     Returns:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -71,6 +71,7 @@ class Window(NamedTuple):
 
 
 @njit(cache=True)
+@no_type_check
 def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
     """Write value, confidence, state and what was taken off of every node of a window."""
     shape = window.value.shape
@@ -100,11 +101,14 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
                 odds = SEED_ODDS + FAINT_ODDS * faint
                 # The guess's error is Laplace distributed: its chance to be small, times that of the seed.
                 chance = (1 - np.exp(-LARGE_ERROR / max(error, np.float32(1e-3)))) / (1 + odds)
+                # Nobody has looked there: never more likely right than wrong.
+                chance = chance if sign != 0 else 0.5 * chance
                 window.confidence[i, j, k] = int(255 * chance + 0.5)
 
 
 @njit(cache=True)
-def cells_to_refine(window: Window, patches: Patches, bricks: Bricks, corrections, refine, stale):  # type: ignore[no-untyped-def]
+@no_type_check
+def cells_to_refine(window: Window, patches: Patches, bricks: Bricks, corrections, refine, stale):
     """Find the cells in which trilinear interpolation misses the middle of an edge, of a face or of the cell.
 
     Args:
@@ -140,7 +144,8 @@ def cells_to_refine(window: Window, patches: Patches, bricks: Bricks, correction
 
 
 @njit(cache=True)
-def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corrections):  # type: ignore[no-untyped-def]
+@no_type_check
+def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corrections):
     """Write the corrections of cells (n, 3): what interpolation of the corners misses at each of their fine nodes."""
     for n in range(len(cells)):
         i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
@@ -155,7 +160,8 @@ def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corr
 
 
 @njit(cache=True)
-def _fine_value(window, patches, bricks, i, j, k, a, b, c, plain):  # type: ignore[no-untyped-def]
+@no_type_check
+def _fine_value(window, patches, bricks, i, j, k, a, b, c, plain):
     """Distance [m] of the fine node (a, b, c) steps into the cell above node (i, j, k) of the window."""
     at = (i * window.ratio + a, j * window.ratio + b, k * window.ratio + c)
     upper, side, _ = _nearest_patch(window, patches, bricks.voxel, at)
@@ -183,7 +189,8 @@ def _fine_value(window, patches, bricks, i, j, k, a, b, c, plain):  # type: igno
 
 
 @njit(cache=True)
-def _sign(window, bricks, at, side):  # type: ignore[no-untyped-def]
+@no_type_check
+def _sign(window, bricks, at, side):
     """Side of the seen surfaces a fine node lies on by the fused distances: 1, -1, or 0 where none was fused."""
     distance, weight = voxel_at(
         bricks,
@@ -198,7 +205,8 @@ def _sign(window, bricks, at, side):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _nearest_patch(window, patches, voxel, at):  # type: ignore[no-untyped-def]
+@no_type_check
+def _nearest_patch(window, patches, voxel, at):
     """Distance [m] of a fine node to the closest of the patches that are nearest around it, height above it, number."""
     x = voxel * (window.first[0] * window.ratio + at[0])
     y = voxel * (window.first[1] * window.ratio + at[1])
@@ -224,7 +232,8 @@ def _nearest_patch(window, patches, voxel, at):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _corners(window, i, j, k):  # type: ignore[no-untyped-def]
+@no_type_check
+def _corners(window, i, j, k):
     """Of a cell: whether all corners are free with nothing taken off, how much is at most [m], is any state known."""
     plain, most, known = True, np.float32(0), False
     for p in range(2):
@@ -239,13 +248,15 @@ def _corners(window, i, j, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _corner_weight(p, q, r, a, b, c, ratio):  # type: ignore[no-untyped-def]
+@no_type_check
+def _corner_weight(p, q, r, a, b, c, ratio):
     """Weight of corner (p, q, r) of a cell in trilinear interpolation (a, b, c) fine steps into it."""
     return (a if p else ratio - a) * (b if q else ratio - b) * (c if r else ratio - c) / ratio**3
 
 
 @njit(cache=True)
-def _between(value, i, j, k, a, b, c, ratio):  # type: ignore[no-untyped-def]
+@no_type_check
+def _between(value, i, j, k, a, b, c, ratio):
     """Trilinear interpolation of a cell's corners at (a, b, c) fine steps into it."""
     line = 0.0
     for p in range(2):
