@@ -39,7 +39,7 @@ BEYOND_ACROSS, BEYOND_ALONG = 2.5, 1.5
 MARGIN = 0.8
 # A frame is passed over when more than this share of at least so many points contradicts the map, but no more than
 # so many frames in a row: then the world has changed, not the frame.
-CONTRADICTED, JUDGED, PATIENCE = 0.45, 60, 5
+CONTRADICTED, JUDGED, PATIENCE = 0.35, 60, 5
 # Columns of an image that are compared with the map.
 COLUMNS = 80
 
@@ -243,7 +243,7 @@ class Mapper:
         """Where something stands in space known to be free; None if the frame is to be passed over."""
         if not self._ready:
             return np.zeros((-(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), dtype=bool)
-        appeared, contradicted, known = compare(self.lattice.arrays, depth, stride, _intrinsics(frame), T)
+        appeared, contradicted, known = compare(self.lattice.arrays, self.bricks.arrays, depth, stride, _intrinsics(frame), T)
         if known >= JUDGED and contradicted > CONTRADICTED and self._refused < PATIENCE:
             self._refused += 1
             self.frames_skipped += 1
