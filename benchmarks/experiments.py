@@ -11,7 +11,7 @@ from isdf.bounds import BoundMethod
 from isdf.datasets import DepthSequence
 from isdf.methods import Config, OnlineMapper
 from isdf.runner import RunReport, Watch, run_at_rate, run_at_steps
-from isdf.voxel import ExactConfig, KinectFusionConfig
+from isdf.voxel import ExactConfig, FiestaConfig, KinectFusionConfig, VoxbloxConfig
 
 Experiment = Literal["main", "half", "bounds", "fidelity", "fidelity-bounds", "real"]
 REAL: Experiment = "real"
@@ -68,11 +68,15 @@ class Job:
 
 METHODS: dict[str, Config] = {
     "isdf": IsdfConfig(),
+    "voxblox": VoxbloxConfig(),
+    "fiesta": FiestaConfig(),
     "kinectfusion": KinectFusionConfig(),
     "exact": ExactConfig(),
 }
 # At half the budget the paper's rivals must do with larger voxels to stay real-time; the others keep theirs.
 HALF_BUDGET: dict[str, Config] = METHODS | {
+    "voxblox": VoxbloxConfig(voxel=0.078),
+    "fiesta": FiestaConfig(voxel=0.078),
     "kinectfusion": KinectFusionConfig(voxel=0.08),
 }
 

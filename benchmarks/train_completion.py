@@ -4,8 +4,8 @@
     python -m benchmarks.train_completion train runs/completion --out isdf/data/completion.safetensors
 
 `data` moves a camera about in each room in one of three ways (driving through, going round a piece of furniture,
-looking down on one as a robot does that grasps), notes now and then what is proven of every node of a window about it, and the
-true distances there. No room of `robots.simulation.scenes` takes part.
+looking down on one as a robot does that grasps), notes now and then what is proven of every node of a window about it,
+and the true distances there. No room of `robots.simulation.scenes` takes part.
 """
 
 from __future__ import annotations

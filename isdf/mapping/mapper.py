@@ -243,7 +243,9 @@ class Mapper:
         """Where something stands in space known to be free; None if the frame is to be passed over."""
         if not self._ready:
             return np.zeros((-(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), dtype=bool)
-        appeared, contradicted, known = compare(self.lattice.arrays, self.bricks.arrays, depth, stride, _intrinsics(frame), T)
+        appeared, contradicted, known = compare(
+            self.lattice.arrays, self.bricks.arrays, depth, stride, _intrinsics(frame), T
+        )
         if known >= JUDGED and contradicted > CONTRADICTED and self._refused < PATIENCE:
             self._refused += 1
             self.frames_skipped += 1

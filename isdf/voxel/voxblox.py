@@ -65,9 +65,9 @@ class VoxbloxConfig:
 class VoxbloxMapper(VoxelMapper):
     """Fuses rays into a TSDF and keeps a quasi-Euclidean distance field up to date; see `VoxelMapper`.
 
-    Distances grow along the 26 directions between voxels, so far from surfaces they are up to 13 % too large (8 % within
-    a plane of voxels). Space that no ray was followed through is unmapped: confidence 0, and the distance of the nearest
-    mapped voxel.
+    Distances grow along the 26 directions between voxels, so they are up to 13 % too large far from surfaces (8 % in a
+    plane of voxels). Space that no ray was followed through is unmapped: confidence 0, and the distance of the
+    nearest mapped voxel.
 
     Args:
         config: see `VoxbloxConfig`.

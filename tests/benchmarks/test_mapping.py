@@ -139,7 +139,10 @@ BACKENDS = [
     pytest.param(
         "dask",
         2,
-        marks=pytest.mark.skipif(not importlib.util.find_spec("distributed"), reason="needs `distributed`"),
+        marks=[
+            pytest.mark.slow,
+            pytest.mark.skipif(not importlib.util.find_spec("distributed"), reason="needs `distributed`"),
+        ],
     ),
 ]
 
