@@ -160,7 +160,19 @@ def test_watching_costs_the_mapper_no_time(sequence_dir) -> None:
 
 def test_map_then_query(sequence_dir, tmp_path, monkeypatch, capsys) -> None:
     out = tmp_path / "run"
-    run_cli(monkeypatch, "map", sequence_dir, "--out", out, "--steps-per-frame", 8, "--mesh-spacing", 0.1)
+    run_cli(
+        monkeypatch,
+        "map",
+        sequence_dir,
+        "--out",
+        out,
+        "--method",
+        "isdf",
+        "--steps-per-frame",
+        8,
+        "--mesh-spacing",
+        0.1,
+    )
     report = json.loads((out / "report.json").read_text())
     assert report["steps"] == 96 and report["frames_used"] == 12
     assert len(trimesh.load(out / "mesh.ply").faces) == report["mesh_faces"] > 100
