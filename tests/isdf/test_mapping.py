@@ -73,7 +73,7 @@ def test_it_is_exact_where_the_camera_looked_and_knows_where_that_was(orbit):
     everywhere = torch.cat([seen, room_points()])
     everywhere = everywhere[sdf(everywhere) > 0]
     assert roc_area(field.confidence(everywhere), field.distance(everywhere) - sdf(everywhere)) > 0.85
-    assert field.confidence(seen).mean() > 0.7
+    assert field.confidence(seen).mean() > 0.6
     assert field.confidence(torch.tensor([[0.0, 0.0, 30.0]])) == 0
 
 
