@@ -6,7 +6,7 @@ import cProfile
 import pstats
 import time
 
-from isdf import Mapper
+from isdf import IsdfMapper
 
 # Functions by whose running time, all they call included, a stage is measured: (file's end, name).
 STAGES = {
@@ -17,7 +17,7 @@ STAGES = {
 }
 
 
-def stage_times(mapper: Mapper, steps: int) -> dict[str, float]:
+def stage_times(mapper: IsdfMapper, steps: int) -> dict[str, float]:
     """CPU time of each stage of a training step [ms], with what is left as "other" and their sum as "step".
 
     Args:
