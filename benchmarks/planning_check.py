@@ -72,7 +72,7 @@ class Checker:
             return "start differs"
         if not self._reaches(problem, path[-1], goal):
             return "goal missed"
-        for a, b in zip(path[:-1], path[1:], strict=True):
+        for a, b in itertools.pairwise(path):
             count = max(1, int(np.ceil(np.abs(b - a).max() / STEP)))
             for share in np.arange(count) / count:
                 if fault := self.state_fault(problem, a + share * (b - a)):
@@ -115,9 +115,13 @@ class Checker:
                 shape = self._bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
             else:
                 height, radius = o["dimensions"]
-                shape = self._bullet.createCollisionShape(pybullet.GEOM_CYLINDER, radius=radius, height=height)
+                shape = self._bullet.createCollisionShape(
+                    pybullet.GEOM_CYLINDER, radius=radius, height=height
+                )
             self._solids.append(
-                self._bullet.createMultiBody(0, shape, basePosition=o["position"], baseOrientation=o["quat_xyzw"])
+                self._bullet.createMultiBody(
+                    0, shape, basePosition=o["position"], baseOrientation=o["quat_xyzw"]
+                )
             )
 
     def _pose(self, problem: Mapping[str, Any], q: np.ndarray) -> None:

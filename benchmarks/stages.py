@@ -31,7 +31,7 @@ def stage_times(mapper: IsdfMapper, steps: int) -> dict[str, float]:
     profile.runcall(lambda: [mapper.step() for _ in range(steps)])
     stats = pstats.Stats(profile)
     times = {stage: sum(_cumulative(stats, *place) for place in places) for stage, places in STAGES.items()}
-    step = _cumulative(stats, "isdf/mapper.py", "step")
+    step = _cumulative(stats, "isdf/isdf_mapper.py", "step")
     times |= {"other": step - sum(times.values()), "step": step}
     return {stage: 1e3 * seconds / steps for stage, seconds in times.items()}
 

@@ -126,7 +126,13 @@ class Chomp:
         history: list[float] = []
         for attempt in range(config.max_tightenings + config.restarts + 1):
             descent = descend(
-                objective, q, config.descent, lambda x: run.settled(x, metric), history, config.max_iterations, late
+                objective,
+                q,
+                config.descent,
+                lambda x: run.settled(x, metric),
+                history,
+                config.max_iterations,
+                late,
             )
             best = run.best_of(descent, guesses, best, late)
             if best.verdict.success or best.verdict.status is Status.INVALID_FIELD or late():

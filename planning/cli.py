@@ -49,12 +49,16 @@ class Solve:
         problems = _limited(load_problems(self.problems), self.limit)
         solver = Solver(load_robot(self.loader, self.robot), self.config)
         if problems:
-            solver.solve(problems[0], self.deadline)  # compiles what is not in numba's cache, outside of the clock
+            solver.solve(
+                problems[0], self.deadline
+            )  # compiles what is not in numba's cache, outside of the clock
         results = []
         for problem in problems:
             result = solver.solve(problem, self.deadline)
             results.append(result)
-            logger.info("%s %d: %s in %.3f s", problem.set, problem.index, result["status"], result["seconds"])
+            logger.info(
+                "%s %d: %s in %.3f s", problem.set, problem.index, result["status"], result["seconds"]
+            )
         self.out.parent.mkdir(parents=True, exist_ok=True)
         self.out.write_text(json.dumps(results))
         print(table(results))
@@ -85,9 +89,12 @@ def table(results: list[dict[str, Any]]) -> str:
     for name, members in [*sorted(sets.items()), ("all", results)]:
         solved = [m for m in members if m["status"] == "success"]
         seconds = np.array([m["seconds"] for m in members] or [np.nan])
-        lengths = [float(np.linalg.norm(np.diff(np.array(m["waypoints"]), axis=0), axis=1).sum()) for m in solved]
+        lengths = [
+            float(np.linalg.norm(np.diff(np.array(m["waypoints"]), axis=0), axis=1).sum()) for m in solved
+        ]
         lines.append(
-            f"{name:20s} {len(solved):4d}/{len(members):<4d} {np.median(seconds):7.3f}s {np.quantile(seconds, 0.95):7.3f}s"
+            f"{name:20s} {len(solved):4d}/{len(members):<4d} {np.median(seconds):7.3f}s "
+            f"{np.quantile(seconds, 0.95):7.3f}s"
             f"  {np.median(lengths) if lengths else np.nan:.2f}"
         )
     return "\n".join(lines)

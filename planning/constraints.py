@@ -53,8 +53,12 @@ class GoalPose:
         if self.free_axis is not None:
             across = [i for i in range(3) if i != self.free_axis]
             turn = relative[..., across, self.free_axis]
-            behind = relative[..., self.free_axis, self.free_axis] < 0  # pointing the wrong way is no solution
-            turn = torch.where(behind.unsqueeze(-1), turn / turn.norm(dim=-1, keepdim=True).clamp_min(1e-6), turn)
+            behind = (
+                relative[..., self.free_axis, self.free_axis] < 0
+            )  # pointing the wrong way is no solution
+            turn = torch.where(
+                behind.unsqueeze(-1), turn / turn.norm(dim=-1, keepdim=True).clamp_min(1e-6), turn
+            )
         else:
             twist = relative - relative.transpose(-1, -2)
             turn = 0.5 * torch.stack([twist[..., 2, 1], twist[..., 0, 2], twist[..., 1, 0]], dim=-1)

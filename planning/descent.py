@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from planning.objective import Evaluation, Objective
+from planning.objective import Objective
 
 
 @dataclass(frozen=True)

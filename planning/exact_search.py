@@ -52,7 +52,9 @@ def search(
     best, found, samples = None, 0, SAMPLES
     for attempt in range(1000):
         goal = targets[attempt % len(targets)]
-        tight = world._replace(margin=world.margin * 0.5 ** (attempt // (2 * len(targets)) if best is None else 0))
+        tight = world._replace(
+            margin=world.margin * 0.5 ** (attempt // (2 * len(targets)) if best is None else 0)
+        )
         reach = MOTION_PER_METRE * config.reach
         path = connect(tight, ends[0], goal, rng, reach, config.resolution, NODES, samples)
         if len(path):
@@ -82,4 +84,6 @@ def _with_end_margins(shape: ExactShape, ends: np.ndarray, config: RrtConfig):  
     keep = [float(depth[i]) for i in range(len(ends)) if usable[i]]
     margin = max(config.min_margin, min([config.margin, *keep]) - 1e-9)
     gaps = [float(gap[i]) for i in range(len(ends)) if usable[i]]
-    return world._replace(margin=margin, self_margin=max(config.self_margin, min([0.002, *gaps]) - 1e-9)), usable
+    return world._replace(
+        margin=margin, self_margin=max(config.self_margin, min([0.002, *gaps]) - 1e-9)
+    ), usable

@@ -16,7 +16,9 @@ WIDEST_GAP = 0.05  # [m] between links beyond which nobody asks how far apart th
 LIMIT_TOLERANCE = 1e-5  # [rad | m] taken for rounding, as by the check
 UNLIMITED = 1e3  # stands for the limit of a joint without one [rad | m]
 
-_bodies: WeakKeyDictionary = WeakKeyDictionary()  # robots are immutable, and building their trees takes a while
+_bodies: WeakKeyDictionary = (
+    WeakKeyDictionary()
+)  # robots are immutable, and building their trees takes a while
 
 
 class ExactShape:
@@ -46,7 +48,12 @@ class ExactShape:
 
         order = np.arange(len(states)) - 1  # the last state first: both ends are to be told exactly
         depth, link, gap, pair = measure(
-            self.world, states.double().numpy(), order % len(states), margin + 1e-3, self_margin + 1e-3, WIDEST_GAP
+            self.world,
+            states.double().numpy(),
+            order % len(states),
+            margin + 1e-3,
+            self_margin + 1e-3,
+            WIDEST_GAP,
         )
         return (
             torch.from_numpy(depth),
@@ -59,8 +66,7 @@ class ExactShape:
 def exact_shape(
     robot: SphereRobot, sdf: DistanceField | CostField, config: WorkspaceConfig | None = None
 ) -> ExactShape | None:
-    """The exact shape of a robot in a field, or None where one of them cannot be compiled, nor can unknown space.
-    """
+    """The exact shape of a robot in a field, or None where one of them cannot be compiled, nor can unknown space."""
     field = sdf.field if isinstance(sdf, CostField) else sdf
     if not isinstance(robot, CompilableRobot) or not isinstance(field, CompilableField):
         return None

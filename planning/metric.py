@@ -50,7 +50,9 @@ class Metric:
     arguments keep their type.
     """
 
-    def __init__(self, num_waypoints: int, config: MetricConfig | None = None, free_goal: bool = False) -> None:
+    def __init__(
+        self, num_waypoints: int, config: MetricConfig | None = None, free_goal: bool = False
+    ) -> None:
         if num_waypoints < 3:
             raise ConfigError(
                 f"Metric: at least 3 waypoints are needed, got {num_waypoints}; resample first."
@@ -82,7 +84,9 @@ class Metric:
         """A^-1 times a gradient over the interior waypoints."""
         return (self.inverse @ gradient.double()).to(gradient)
 
-    def smooth_noise(self, noise: Float[Tensor, "*batch n_interior k"]) -> Float[Tensor, "*batch n_interior k"]:
+    def smooth_noise(
+        self, noise: Float[Tensor, "*batch n_interior k"]
+    ) -> Float[Tensor, "*batch n_interior k"]:
         """Standard normal numbers turned into a sample of N(0, A^-1): a smooth random motion."""
         return (torch.linalg.cholesky(self.inverse) @ noise.double()).to(noise)
 

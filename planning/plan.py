@@ -114,18 +114,26 @@ class Planner:
         seconds: float | None,
     ) -> Float[Tensor, "k dof"] | NoPath:
         """A free path to the first goal that a search reaches."""
-        rrt = self.config.rrt if seconds is None else replace(
-            self.config.rrt, seconds=min(self.config.rrt.seconds, seconds)
+        rrt = (
+            self.config.rrt
+            if seconds is None
+            else replace(self.config.rrt, seconds=min(self.config.rrt.seconds, seconds))
         )
         path: Float[Tensor, "k dof"] | NoPath = NoPath("no goal")
         for goal in goals:
-            path = rrt_connect(self.robot, sdf, start, goal, replace(rrt, seconds=rrt.seconds / len(goals)), self.seed)
+            path = rrt_connect(
+                self.robot, sdf, start, goal, replace(rrt, seconds=rrt.seconds / len(goals)), self.seed
+            )
             if not isinstance(path, NoPath):
                 break
         return path
 
     def _smoothed(
-        self, path: Float[Tensor, "k dof"], sdf: DistanceField | CostField, chomp: Chomp, seconds: float | None
+        self,
+        path: Float[Tensor, "k dof"],
+        sdf: DistanceField | CostField,
+        chomp: Chomp,
+        seconds: float | None,
     ) -> PlanResult:
         """CHOMP from a searched path, or where it leaves what is free, that path."""
         config = self.config

@@ -48,8 +48,8 @@ class Problem:
 def load_problems(path: str | Path) -> list[Problem]:
     """Read a JSON file (gzipped or not) with a list `problems`.
 
-    Each has set, index, joints, start, goal, optionally start_all {joint: value}, and obstacles with type (box, cylinder
-    or sphere), dimensions (full side lengths; height and radius; radius), position and quat_xyzw [m].
+    Each has set, index, joints, start, goal, optionally start_all {joint: value}, and obstacles with type (box,
+    cylinder or sphere), dimensions (full side lengths; height and radius; radius), position and quat_xyzw [m].
 
     Raises:
         ProblemError: where the file cannot be read or an entry is incomplete or malformed.
@@ -59,7 +59,9 @@ def load_problems(path: str | Path) -> list[Problem]:
         content = json.loads(gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw)
         entries = content["problems"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ProblemError(f"{path}: no JSON file with a list `problems` ({type(error).__name__}: {error}).") from error
+        raise ProblemError(
+            f"{path}: no JSON file with a list `problems` ({type(error).__name__}: {error})."
+        ) from error
     return [_problem(entry, f"{path}: problem {i}") for i, entry in enumerate(entries)]
 
 
@@ -67,17 +69,32 @@ def _problem(entry: dict[str, Any], where: str) -> Problem:
     try:
         start, goal = (torch.tensor(entry[key], dtype=torch.float64) for key in ("start", "goal"))
         solids = tuple(
-            Solid(o["type"], tuple(o["dimensions"]), tuple(o["position"]), tuple(o.get("quat_xyzw", (0, 0, 0, 1))))
+            Solid(
+                o["type"],
+                tuple(o["dimensions"]),
+                tuple(o["position"]),
+                tuple(o.get("quat_xyzw", (0, 0, 0, 1))),
+            )
             for o in entry["obstacles"]
         )
         joints = tuple(entry["joints"])
         problem = Problem(
-            str(entry["set"]), int(entry["index"]), joints, start, goal, dict(entry.get("start_all", {})), solids
+            str(entry["set"]),
+            int(entry["index"]),
+            joints,
+            start,
+            goal,
+            dict(entry.get("start_all", {})),
+            solids,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ProblemError(f"{where}: {type(error).__name__}: {error}.") from error
     if start.shape != (len(joints),) or goal.shape != start.shape:
-        raise ProblemError(f"{where}: {len(joints)} joints, but start has {len(start)} values and goal {len(goal)}.")
+        raise ProblemError(
+            f"{where}: {len(joints)} joints, but start has {len(start)} values and goal {len(goal)}."
+        )
     if not (torch.isfinite(start).all() and torch.isfinite(goal).all()):
-        raise ProblemError(f"{where}: start and goal must be finite, got {start.tolist()} and {goal.tolist()}.")
+        raise ProblemError(
+            f"{where}: start and goal must be finite, got {start.tolist()} and {goal.tolist()}."
+        )
     return problem

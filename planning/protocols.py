@@ -153,5 +153,5 @@ class CompilableField(DistanceField, Protocol):
 
     @property
     def solids(self) -> Any:
-        """Arrays kind (n,) (0 box, 1 cylinder, 2 ball), turn (n, 3, 3) world to solid, centre, size, grid, low, voxel."""
+        """Arrays kind (n,) (0 box, 1 cylinder, 2 ball), turn (n, 3, 3) to solid, centre, size, grid, low, voxel."""
         ...

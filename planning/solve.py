@@ -50,7 +50,9 @@ def _planner() -> PlannerConfig:
             max_tightenings=2,
             restarts=0,
         ),
-        rrt=RrtConfig(margin=0.005, reach=0.5, resolution=0.04, shortcut_rounds=150, seconds=5.0, candidates=6),
+        rrt=RrtConfig(
+            margin=0.005, reach=0.5, resolution=0.04, shortcut_rounds=150, seconds=5.0, candidates=6
+        ),
     )
 
 
@@ -122,7 +124,9 @@ class Solver:
             )
         if not isinstance(self._robot, PosableRobot):
             if set(problem.joints) != set(self._robot.joint_names):
-                raise ProblemError(f"{problem.set} {problem.index}: the robot cannot hold joints that are not planned.")
+                raise ProblemError(
+                    f"{problem.set} {problem.index}: the robot cannot hold joints that are not planned."
+                )
             return self._robot
         allowed = set(self._robot.holdable_joints) - set(problem.joints)
         held = {name: value for name, value in problem.posture.items() if name in allowed}
@@ -130,4 +134,3 @@ class Solver:
         if key not in self._posed:
             self._posed[key] = self._robot.with_fixed(held)
         return self._posed[key]
-

@@ -22,7 +22,10 @@ class TorchKinematics:
             return self._robot.spheres(q)[0]
 
     def pull_back(
-        self, q: Float[Tensor, "*batch dof"], centres: Float[Tensor, "*batch s 3"], forces: Float[Tensor, "*batch s 3"]
+        self,
+        q: Float[Tensor, "*batch dof"],
+        centres: Float[Tensor, "*batch s 3"],
+        forces: Float[Tensor, "*batch s 3"],
     ) -> Float[Tensor, "*batch dof"]:
         """J^T f: the gradient by the joints of a cost whose gradient by the sphere centres is `forces`."""
         states = q.detach().requires_grad_()
@@ -52,7 +55,10 @@ class CompiledKinematics(TorchKinematics):
         return torch.from_numpy(centres).to(q).view(*q.shape[:-1], -1, 3)
 
     def pull_back(
-        self, q: Float[Tensor, "*batch dof"], centres: Float[Tensor, "*batch s 3"], forces: Float[Tensor, "*batch s 3"]
+        self,
+        q: Float[Tensor, "*batch dof"],
+        centres: Float[Tensor, "*batch s 3"],
+        forces: Float[Tensor, "*batch s 3"],
     ) -> Float[Tensor, "*batch dof"]:
         """J^T f, from the geometric Jacobian."""
         from planning.compiled.kinematics import pull_back

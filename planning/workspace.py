@@ -132,7 +132,9 @@ class Workspace:
             distance, gradient = self.field.distance_and_gradient(centres)
             clearance = distance - radii
             if self.floor is not None:
-                clearance = clearance.masked_fill(self._on_floor(distance[..., self.floor], centres), torch.inf)
+                clearance = clearance.masked_fill(
+                    self._on_floor(distance[..., self.floor], centres), torch.inf
+                )
             return clearance, gradient
         clearance = self.clearance(centres, radii)
         near = clearance < self.eps

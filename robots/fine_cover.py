@@ -47,9 +47,11 @@ def fine_cover(urdf: str | Path, config: FineCoverConfig | None = None) -> dict[
     pieces = collision_pieces(urdf)
     path = cache_dir() / f"fine-{_digest(pieces, config)}.npz"
     if not path.is_file():
-        covers = {link: np.concatenate([cover_hull(p, config) for p in parts]) for link, parts in pieces.items()}
+        covers = {
+            link: np.concatenate([cover_hull(p, config) for p in parts]) for link, parts in pieces.items()
+        }
         with path.with_suffix(".part").open("wb") as handle:
-            np.savez(handle, **covers)
+            np.savez(handle, **covers)  # type: ignore[arg-type]
         path.with_suffix(".part").replace(path)
     with np.load(path) as stored:
         return {link: stored[link] for link in stored.files}
@@ -63,7 +65,9 @@ def cover_hull(piece: trimesh.Trimesh, config: FineCoverConfig, seed: int = 0) -
     """
     hull = piece.convex_hull
     targets, normals = _surface(hull, config.spacing, seed)
-    planes = np.unique(np.round(np.c_[hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(1)], 7), axis=0)
+    planes = np.unique(
+        np.round(np.c_[hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(1)], 7), axis=0
+    )
     centres, radii = _candidates(targets, normals, planes, config)
     tree = cKDTree(targets - config.uncovered * normals)
     covers = tree.query_ball_point(centres, radii)

@@ -69,7 +69,9 @@ class MovingFrames:
         if key not in self._compiled:
             chain = pytorch_kinematics.build_chain_from_urdf(self._urdf).to(dtype=q.dtype, device=q.device)
             numbers = [int(name.removeprefix("joint_")) for name in chain.get_joint_parameter_names()]
-            column, multiplier, offset = zip(*(self.moves[number - 1].source for number in numbers), strict=True)
+            column, multiplier, offset = zip(
+                *(self.moves[number - 1].source for number in numbers), strict=True
+            )
             frames = [chain.frame_to_idx[f"frame_{i}"] for i in range(len(self.moves) + 1)]
             self._compiled[key] = (
                 chain,

@@ -41,8 +41,9 @@ class SphereTree(NamedTuple):
 class Solids(NamedTuple):
     """Solids, one a row of `table`, and a voxel grid, empty where there is none.
 
-    A row holds the rotation from world to solid (0-8), the centre (9-11), sizes (12-14), the radius of a ball round the
-    solid (15) and its kind (16): 0 for a box with half sizes, 1 for a cylinder with radius and half height, 2 for a ball.
+    A row holds the rotation from world to solid (0-8), the centre (9-11), sizes (12-14), the radius of a ball round
+    the solid (15) and its kind (16): 0 for a box with half sizes, 1 for a cylinder with radius and half height, 2 for
+    a ball.
     One table instead of an array for each, since passing arrays to small functions costs more than these compute.
     """
 
@@ -107,7 +108,9 @@ def solids_of(field: CompilableField) -> Solids:
     )
 
 
-def _grow(nodes: list[tuple[int, np.ndarray, float, int, bool]], frame: int, balls: Float[np.ndarray, "n 4"]) -> None:
+def _grow(
+    nodes: list[tuple[int, np.ndarray, float, int, bool]], frame: int, balls: Float[np.ndarray, "n 4"]
+) -> None:
     """Append the subtree of some balls, halved along their longest extent until few are left."""
     at = len(nodes)
     centre, radius = _enclosing(balls)
@@ -153,4 +156,3 @@ def joint_weights(
             turned = place(poses(chain, moved), frame, centre)
             weights[joint] = max(weights[joint], float(np.linalg.norm(turned - before, axis=1).max()) / 1e-3)
     return weights
-

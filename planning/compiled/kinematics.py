@@ -36,8 +36,8 @@ def _moved(chain: Chain, j: int, value: float, out: np.ndarray) -> None:
     x, y, z = chain.axis[j, 0], chain.axis[j, 1], chain.axis[j, 2]
     if chain.prismatic[j]:
         for r in range(3):
-            for c in range(4):
-                out[r, c] = origin[j, r, c]
+            for k in range(4):
+                out[r, k] = origin[j, r, k]
             out[r, 3] += value * (origin[j, r, 0] * x + origin[j, r, 1] * y + origin[j, r, 2] * z)
         return
     s, c = math.sin(value), math.cos(value)

@@ -11,7 +11,9 @@ from planning.compiled.states import World, at, gap
 
 
 @njit(cache=True)
-def measure(world: World, states: np.ndarray, order: np.ndarray, floor: float, self_floor: float, widest: float):
+def measure(
+    world: World, states: np.ndarray, order: np.ndarray, floor: float, self_floor: float, widest: float
+):
     """Clearance, its link, self-collision gap and its pair for every state (n, dof), visited in an order.
 
     Values are exact where they are the least so far or below their floor [m], and upper bounds elsewhere; gaps are
@@ -26,7 +28,9 @@ def measure(world: World, states: np.ndarray, order: np.ndarray, floor: float, s
         depth[s], link[s] = _clearance(world, frames, max(least, floor))
         least = min(least, depth[s])
         bound = min(max(narrowest, self_floor), widest)
-        gaps[s], pair[s, 0], pair[s, 1] = _least_gap(tree.ball, tree.walk, tree.roots, tree.pairs, frames, bound)
+        gaps[s], pair[s, 0], pair[s, 1] = _least_gap(
+            tree.ball, tree.walk, tree.roots, tree.pairs, frames, bound
+        )
         narrowest = min(narrowest, gaps[s])
     return depth, link, gaps, pair
 

@@ -86,7 +86,9 @@ def _steered(world: World, origin: np.ndarray, towards: np.ndarray, reach: float
 
 
 @njit(cache=True)
-def _added(nodes: np.ndarray, parents: np.ndarray, sizes: np.ndarray, side: int, q: np.ndarray, parent: int) -> int:
+def _added(
+    nodes: np.ndarray, parents: np.ndarray, sizes: np.ndarray, side: int, q: np.ndarray, parent: int
+) -> int:
     at = sizes[side]
     nodes[at] = q
     parents[at] = parent
@@ -126,7 +128,9 @@ def length(path: np.ndarray) -> float:
 
 
 @njit(cache=True)
-def shorten(world: World, path: np.ndarray, rng: np.random.Generator, resolution: float, rounds: int) -> np.ndarray:
+def shorten(
+    world: World, path: np.ndarray, rng: np.random.Generator, resolution: float, rounds: int
+) -> np.ndarray:
     """Replace stretches of a free path between random points on it by straight edges, where these are free."""
     for k in range(rounds):
         if len(path) == 2:

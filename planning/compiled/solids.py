@@ -66,7 +66,9 @@ def solid_gradient(table: np.ndarray, i: int, x: float, y: float, z: float) -> t
 
 
 @njit(cache=True)
-def _cylinder_gradient(a: float, b: float, c: float, radius: float, half: float) -> tuple[float, float, float]:
+def _cylinder_gradient(
+    a: float, b: float, c: float, radius: float, half: float
+) -> tuple[float, float, float]:
     up = math.copysign(1.0, c)
     radial = math.sqrt(a * a + b * b)
     u, v = (a / radial, b / radial) if radial > 0.0 else (1.0, 0.0)
@@ -78,7 +80,9 @@ def _cylinder_gradient(a: float, b: float, c: float, radius: float, half: float)
 
 
 @njit(cache=True)
-def _box_gradient(a: float, b: float, c: float, sa: float, sb: float, sc: float) -> tuple[float, float, float]:
+def _box_gradient(
+    a: float, b: float, c: float, sa: float, sb: float, sc: float
+) -> tuple[float, float, float]:
     da, db, dc = abs(a) - sa, abs(b) - sb, abs(c) - sc
     pa, pb, pc = max(da, 0.0), max(db, 0.0), max(dc, 0.0)
     norm = math.sqrt(pa * pa + pb * pb + pc * pc)
@@ -112,7 +116,12 @@ def grid_sample(solids: Solids, x: float, y: float, z: float) -> tuple[float, fl
     gx, gy, gz = f1 - f0, (f01 - f00) * (1 - a) + (f11 - f10) * a, front - back
     value = f0 * (1 - a) + f1 * a
     if cu != u or cv != v or cw != w:
-        return value, 0.0 if cu != u else gx / voxel, 0.0 if cv != v else gy / voxel, 0.0 if cw != w else gz / voxel
+        return (
+            value,
+            0.0 if cu != u else gx / voxel,
+            0.0 if cv != v else gy / voxel,
+            0.0 if cw != w else gz / voxel,
+        )
     return value, gx / voxel, gy / voxel, gz / voxel
 
 
@@ -153,6 +162,8 @@ def distances_and_gradients(solids: Solids, points: np.ndarray) -> tuple[np.ndar
 
 
 @njit(cache=True)
-def solid_is_floor(table: np.ndarray, i: int, d: float, x: float, y: float, z: float, tolerance: float) -> bool:
+def solid_is_floor(
+    table: np.ndarray, i: int, d: float, x: float, y: float, z: float, tolerance: float
+) -> bool:
     """Whether solid i at distance d of a point is the floor z = 0: as far off as that, and straight below."""
     return abs(d - z) <= tolerance and solid_gradient(table, i, x, y, z)[2] > FLOOR_SLOPE

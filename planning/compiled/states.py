@@ -39,7 +39,16 @@ def free(world: World, q: np.ndarray) -> bool:
             return False
     frames = poses(world.chain, q)
     tree, solids = world.tree, world.solids
-    if not _clear_of_solids(tree.ball, tree.walk, tree.roots, tree.floor, solids.table, frames, world.margin, world.floor_tolerance):
+    if not _clear_of_solids(
+        tree.ball,
+        tree.walk,
+        tree.roots,
+        tree.floor,
+        solids.table,
+        frames,
+        world.margin,
+        world.floor_tolerance,
+    ):
         return False
     if len(solids.grid) > 0 and not _clear_of_grid(tree, solids, frames, world.margin, world.floor_tolerance):
         return False
@@ -93,7 +102,9 @@ def _clear_of_solids(
 
 
 @njit(cache=True)
-def _clear_of_grid(tree: SphereTree, solids: Solids, frames: np.ndarray, margin: float, tolerance: float) -> bool:
+def _clear_of_grid(
+    tree: SphereTree, solids: Solids, frames: np.ndarray, margin: float, tolerance: float
+) -> bool:
     """Whether all spheres keep the margin from what the grid holds."""
     for link in range(len(tree.roots) - 1):
         node, end = tree.roots[link], tree.roots[link + 1]
@@ -113,7 +124,12 @@ def _clear_of_grid(tree: SphereTree, solids: Solids, frames: np.ndarray, margin:
 
 @njit(cache=True)
 def _links_apart(
-    ball: np.ndarray, walk: np.ndarray, roots: np.ndarray, pairs: np.ndarray, frames: np.ndarray, margin: float
+    ball: np.ndarray,
+    walk: np.ndarray,
+    roots: np.ndarray,
+    pairs: np.ndarray,
+    frames: np.ndarray,
+    margin: float,
 ) -> bool:
     """Whether no two links that may not touch do."""
     for p in range(len(pairs)):
@@ -196,4 +212,3 @@ def first_blocked(world: World, path: np.ndarray, resolution: float) -> int:
         if not edge_free(world, path[i], path[i + 1], resolution):
             return i
     return -1
-

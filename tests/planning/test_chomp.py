@@ -107,7 +107,9 @@ def test_rotating_the_world_rotates_the_path():
     angle = torch.tensor(0.7)
     turn = torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
     goal, pole = torch.tensor([2.0, 0.0]), torch.tensor([1.0, 0.1])
-    config = ChompConfig(perturbation=1e-9, descent=DescentConfig(max_update=10.0))  # the cap is a joint's own and so not invariant
+    config = ChompConfig(
+        perturbation=1e-9, descent=DescentConfig(max_update=10.0)
+    )  # the cap is a joint's own and so not invariant
     plain = Chomp(Disc(), config).optimise(
         _line([0.0, 0.0], goal.tolist()), Cylinder(tuple(pole.tolist()), 0.3)
     )
@@ -157,7 +159,9 @@ def test_poles_between_waypoints_are_seen_in_the_end():
     line = _line([0.0, 0.0], [2.0, 0.0], 5)
     result = Chomp(Disc(0.02)).optimise(line, Cylinder((0.75, 0.005), 0.03))
     assert result.success, result.message
-    unaided = Chomp(Disc(0.02), ChompConfig(max_tightenings=0, restarts=0)).optimise(line, Cylinder((0.75, 0.005), 0.03))
+    unaided = Chomp(Disc(0.02), ChompConfig(max_tightenings=0, restarts=0)).optimise(
+        line, Cylinder((0.75, 0.005), 0.03)
+    )
     assert unaided.status is Status.COLLISION
 
 
