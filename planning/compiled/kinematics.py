@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
@@ -11,6 +12,7 @@ from planning.compiled.arrays import Chain
 
 
 @njit(cache=True)
+@no_type_check
 def poses(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Poses (frames, 3, 4) of all frames in the root's at a configuration q (dof,)."""
     out = np.empty((len(chain.parent) + 1, 3, 4))
@@ -30,6 +32,7 @@ def poses(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
+@no_type_check
 def _moved(chain: Chain, j: int, value: float, out: np.ndarray) -> None:
     """A joint's origin followed by its motion: a slide, or a turn by Rodrigues' formula."""
     origin = chain.origin
@@ -51,6 +54,7 @@ def _moved(chain: Chain, j: int, value: float, out: np.ndarray) -> None:
 
 
 @njit(cache=True)
+@no_type_check
 def place(frames: np.ndarray, frame: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """World positions (s, 3) of points given in frames."""
     out = np.empty_like(centres)
@@ -63,6 +67,7 @@ def place(frames: np.ndarray, frame: np.ndarray, centres: np.ndarray) -> np.ndar
 
 
 @njit(cache=True)
+@no_type_check
 def sphere_centres(chain: Chain, frame: np.ndarray, centres: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Centres (n, s, 3) of spheres at states (n, dof)."""
     out = np.empty((len(states), len(frame), 3))
@@ -72,6 +77,7 @@ def sphere_centres(chain: Chain, frame: np.ndarray, centres: np.ndarray, states:
 
 
 @njit(cache=True)
+@no_type_check
 def pull_back(
     chain: Chain, frame: np.ndarray, states: np.ndarray, points: np.ndarray, forces: np.ndarray
 ) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 from numba import njit
 
@@ -11,6 +13,7 @@ from planning.compiled.states import World, at, gap
 
 
 @njit(cache=True)
+@no_type_check
 def measure(
     world: World, states: np.ndarray, order: np.ndarray, floor: float, self_floor: float, widest: float
 ):
@@ -36,6 +39,7 @@ def measure(
 
 
 @njit(cache=True)
+@no_type_check
 def _clearance(world: World, frames: np.ndarray, least: float) -> tuple[float, int]:
     """Least clearance of any leaf below a bound, else the bound, and the link that has it."""
     ball, walk, solids, table = world.tree.ball, world.tree.walk, world.solids, world.solids.table
@@ -69,6 +73,7 @@ def _clearance(world: World, frames: np.ndarray, least: float) -> tuple[float, i
 
 
 @njit(cache=True)
+@no_type_check
 def _least_gap(
     ball: np.ndarray, walk: np.ndarray, roots: np.ndarray, pairs: np.ndarray, frames: np.ndarray, least: float
 ) -> tuple[float, int, int]:

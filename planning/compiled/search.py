@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
@@ -11,6 +12,7 @@ from planning.compiled.states import World, edge_free, free, motion
 
 
 @njit(cache=True)
+@no_type_check
 def connect(
     world: World,
     start: np.ndarray,
@@ -64,6 +66,7 @@ def connect(
 
 
 @njit(cache=True)
+@no_type_check
 def _nearest(world: World, nodes: np.ndarray, size: int, q: np.ndarray) -> int:
     best, where = np.inf, 0
     for i in range(size):
@@ -77,6 +80,7 @@ def _nearest(world: World, nodes: np.ndarray, size: int, q: np.ndarray) -> int:
 
 
 @njit(cache=True)
+@no_type_check
 def _steered(world: World, origin: np.ndarray, towards: np.ndarray, reach: float) -> np.ndarray:
     """`towards` itself, or the point on the way there as far off as an edge may reach."""
     length = motion(world, origin, towards)
@@ -86,6 +90,7 @@ def _steered(world: World, origin: np.ndarray, towards: np.ndarray, reach: float
 
 
 @njit(cache=True)
+@no_type_check
 def _added(
     nodes: np.ndarray, parents: np.ndarray, sizes: np.ndarray, side: int, q: np.ndarray, parent: int
 ) -> int:
@@ -97,6 +102,7 @@ def _added(
 
 
 @njit(cache=True)
+@no_type_check
 def _joined(nodes: np.ndarray, parents: np.ndarray, side: int, here: int, there: int) -> np.ndarray:
     """The path from the first tree's root over the meeting point to the second's."""
     ends = (here, there) if side == 0 else (there, here)
@@ -119,6 +125,7 @@ def _joined(nodes: np.ndarray, parents: np.ndarray, side: int, here: int, there:
 
 
 @njit(cache=True)
+@no_type_check
 def length(path: np.ndarray) -> float:
     """Sum of the Euclidean lengths of a path's edges [rad | m]."""
     total = 0.0
@@ -128,6 +135,7 @@ def length(path: np.ndarray) -> float:
 
 
 @njit(cache=True)
+@no_type_check
 def shorten(
     world: World, path: np.ndarray, rng: np.random.Generator, resolution: float, rounds: int
 ) -> np.ndarray:
@@ -159,6 +167,7 @@ def shorten(
 
 
 @njit(cache=True)
+@no_type_check
 def _spliced(path: np.ndarray, i: int, j: int, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Path up to vertex i, the edge first-last, and from vertex j + 1 on, without repeated points."""
     out = np.empty((i + 1 + 2 + len(path) - j - 1, path.shape[1]))

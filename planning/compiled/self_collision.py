@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
 
 
 @njit(cache=True)
+@no_type_check
 def pair_costs(
     centres: np.ndarray, radii: np.ndarray, pairs: np.ndarray, eps: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
@@ -14,6 +15,7 @@ FLOOR_SLOPE = 0.5  # least upward component of the gradient above a floor
 
 
 @njit(cache=True)
+@no_type_check
 def solid_distance(table: np.ndarray, i: int, x: float, y: float, z: float) -> float:
     """Signed distance [m] of a point to solid i."""
     dx, dy, dz = x - table[i, 9], y - table[i, 10], z - table[i, 11]
@@ -36,6 +38,7 @@ def solid_distance(table: np.ndarray, i: int, x: float, y: float, z: float) -> f
 
 
 @njit(cache=True)
+@no_type_check
 def beyond(table: np.ndarray, i: int, x: float, y: float, z: float, reach: float) -> bool:
     """Whether a point is further than `reach` from solid i for sure, by the ball round it."""
     dx, dy, dz = x - table[i, 9], y - table[i, 10], z - table[i, 11]
@@ -44,6 +47,7 @@ def beyond(table: np.ndarray, i: int, x: float, y: float, z: float, reach: float
 
 
 @njit(cache=True)
+@no_type_check
 def solid_gradient(table: np.ndarray, i: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Unit gradient of `solid_distance`; a fixed direction where there are several."""
     dx, dy, dz = x - table[i, 9], y - table[i, 10], z - table[i, 11]
@@ -66,6 +70,7 @@ def solid_gradient(table: np.ndarray, i: int, x: float, y: float, z: float) -> t
 
 
 @njit(cache=True)
+@no_type_check
 def _cylinder_gradient(
     a: float, b: float, c: float, radius: float, half: float
 ) -> tuple[float, float, float]:
@@ -80,6 +85,7 @@ def _cylinder_gradient(
 
 
 @njit(cache=True)
+@no_type_check
 def _box_gradient(
     a: float, b: float, c: float, sa: float, sb: float, sc: float
 ) -> tuple[float, float, float]:
@@ -94,6 +100,7 @@ def _box_gradient(
 
 
 @njit(cache=True)
+@no_type_check
 def grid_sample(solids: Solids, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Trilinear distance and its gradient in the grid; beyond its border, the border's value and how far it is."""
     grid, low, voxel = solids.grid, solids.low, solids.voxel
@@ -126,6 +133,7 @@ def grid_sample(solids: Solids, x: float, y: float, z: float) -> tuple[float, fl
 
 
 @njit(cache=True)
+@no_type_check
 def distances(solids: Solids, points: np.ndarray) -> np.ndarray:
     """Signed distances (n,) [m] of points (n, 3) to the nearest solid."""
     out = np.empty(len(points))
@@ -141,6 +149,7 @@ def distances(solids: Solids, points: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
+@no_type_check
 def distances_and_gradients(solids: Solids, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances (n,) [m] and unit gradients (n, 3) at points (n, 3)."""
     out = np.empty(len(points))
@@ -162,6 +171,7 @@ def distances_and_gradients(solids: Solids, points: np.ndarray) -> tuple[np.ndar
 
 
 @njit(cache=True)
+@no_type_check
 def solid_is_floor(
     table: np.ndarray, i: int, d: float, x: float, y: float, z: float, tolerance: float
 ) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from numba import njit
@@ -32,6 +32,7 @@ class World(NamedTuple):
 
 
 @njit(cache=True)
+@no_type_check
 def free(world: World, q: np.ndarray) -> bool:
     """Whether a configuration keeps its limits and margins; links that no joint moves are not looked at."""
     for j in range(len(q)):
@@ -56,6 +57,7 @@ def free(world: World, q: np.ndarray) -> bool:
 
 
 @njit(cache=True)
+@no_type_check
 def _clear_of_solids(
     ball: np.ndarray,
     walk: np.ndarray,
@@ -102,6 +104,7 @@ def _clear_of_solids(
 
 
 @njit(cache=True)
+@no_type_check
 def _clear_of_grid(
     tree: SphereTree, solids: Solids, frames: np.ndarray, margin: float, tolerance: float
 ) -> bool:
@@ -123,6 +126,7 @@ def _clear_of_grid(
 
 
 @njit(cache=True)
+@no_type_check
 def _links_apart(
     ball: np.ndarray,
     walk: np.ndarray,
@@ -156,6 +160,7 @@ def _links_apart(
 
 
 @njit(cache=True)
+@no_type_check
 def at(frames: np.ndarray, ball: np.ndarray, walk: np.ndarray, node: int) -> tuple[float, float, float]:
     """World position of a node's centre [m]."""
     f = walk[node, 0]
@@ -168,12 +173,14 @@ def at(frames: np.ndarray, ball: np.ndarray, walk: np.ndarray, node: int) -> tup
 
 
 @njit(cache=True)
+@no_type_check
 def gap(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
     """Distance of two points [m]."""
     return math.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
 
 
 @njit(cache=True)
+@no_type_check
 def motion(world: World, a: np.ndarray, b: np.ndarray) -> float:
     """Bound [m] on the motion of any sphere from a to b."""
     total = 0.0
@@ -183,6 +190,7 @@ def motion(world: World, a: np.ndarray, b: np.ndarray) -> float:
 
 
 @njit(cache=True)
+@no_type_check
 def edge_free(world: World, a: np.ndarray, b: np.ndarray, resolution: float) -> bool:
     """Whether the straight edge from a (known to be free) to b is; coarse states first, then ever finer ones."""
     count = max(1, math.ceil(motion(world, a, b) / resolution))
@@ -204,6 +212,7 @@ def edge_free(world: World, a: np.ndarray, b: np.ndarray, resolution: float) -> 
 
 
 @njit(cache=True)
+@no_type_check
 def first_blocked(world: World, path: np.ndarray, resolution: float) -> int:
     """Index of the first waypoint that is not free or whose edge to the next is not; -1 if the path is free."""
     if not free(world, path[0]):
