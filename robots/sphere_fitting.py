@@ -144,8 +144,8 @@ def _grown_to(spheres: np.ndarray, points: np.ndarray, lowest: float, gap: float
     for point in points[protruding(spheres, points) > gap]:
         distances = np.linalg.norm(spheres[:, :3] - point, axis=1) - gap
         growth = distances - spheres[:, 3]
-        # Reaching below the height limit weighs thrice: it may cost growth elsewhere, but not any amount.
-        growth += 3.0 * (lowest - (spheres[:, 2] - distances)).clip(min=0)
+        # Reaching below the height limit weighs thirtyfold: it may cost growth elsewhere, but not any amount.
+        growth += 30.0 * (lowest - (spheres[:, 2] - distances)).clip(min=0)
         nearest = int(growth.argmin())
         spheres[nearest, 3] = max(spheres[nearest, 3], distances[nearest])
     return spheres
