@@ -22,13 +22,13 @@ from .network import NetworkConfig, SDFNetwork
 from .sampling import SamplingConfig
 
 if TYPE_CHECKING:
-    from .mapper import Mapper, MapperConfig
+    from .isdf_mapper import IsdfConfig, IsdfMapper
 
 FORMAT = "isdf-map"
 VERSION = 1
 
 
-def save(mapper: Mapper, path: Path) -> None:
+def save(mapper: IsdfMapper, path: Path) -> None:
     """Write the whole state of a mapper; an existing file is replaced only by a complete new one.
 
     Raises:
@@ -38,7 +38,7 @@ def save(mapper: Mapper, path: Path) -> None:
     write(path, *_state(mapper))
 
 
-def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
+def load(path: Path, device: str | torch.device = "cpu") -> IsdfMapper:
     """Read a map written by `save`.
 
     Raises:
@@ -111,7 +111,7 @@ def read(path: Path, expected: str, version: int) -> tuple[dict[str, torch.Tenso
     return tensors, header
 
 
-def _state(mapper: Mapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def _state(mapper: IsdfMapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     tensors: dict[str, torch.Tensor] = {
         "bounds": mapper.bounds,
         "generator": mapper.generator.get_state(),
@@ -146,10 +146,12 @@ def _state(mapper: Mapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     return {name: value.detach().cpu().contiguous() for name, value in tensors.items()}, header
 
 
-def _restore(tensors: dict[str, torch.Tensor], header: dict[str, Any], device: str | torch.device) -> Mapper:
-    from .mapper import Mapper, new_optimiser
+def _restore(
+    tensors: dict[str, torch.Tensor], header: dict[str, Any], device: str | torch.device
+) -> IsdfMapper:
+    from .isdf_mapper import IsdfMapper, new_optimiser
 
-    mapper = Mapper(_config(header["config"]), device)
+    mapper = IsdfMapper(_config(header["config"]), device)
     mapper.frames_seen, mapper.steps = int(header["frames_seen"]), int(header["steps"])
     mapper.generator.set_state(tensors["generator"])
     mapper._bounds = tensors["bounds"]
@@ -186,10 +188,10 @@ def _network(tensors: dict[str, torch.Tensor], prefix: str, config: NetworkConfi
     return network
 
 
-def _config(values: dict[str, Any]) -> MapperConfig:
-    from .mapper import MapperConfig
+def _config(values: dict[str, Any]) -> IsdfConfig:
+    from .isdf_mapper import IsdfConfig
 
-    return MapperConfig(
+    return IsdfConfig(
         **values
         | {
             "network": NetworkConfig(**values["network"]),

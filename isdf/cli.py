@@ -18,10 +18,11 @@ from tqdm import tqdm
 from .datasets import DepthSequence, open_sequence
 from .errors import ConfigError, IsdfError
 from .field import query
-from .mapper import MapperConfig
+from .isdf_mapper import IsdfConfig, IsdfMapper
+from .mapping import MapperConfig
 from .methods import Config, OnlineMapper, VoxelConfig, load_map
 from .runner import RunReport, Watch, run_at_rate, run_at_steps, run_every_frame
-from .voxel import ExactConfig, FiestaConfig, KinectFusionConfig, VoxbloxConfig, VoxelMapper
+from .voxel import ExactConfig, FiestaConfig, KinectFusionConfig, VoxbloxConfig
 
 MAP_FILE = "map.safetensors"
 VOXEL_METHODS: dict[str, type[VoxelConfig]] = {
@@ -51,9 +52,10 @@ class Map:
     """Optimisation steps for each second of sequence; the paper's machine made about 30."""
     cpu_per_second: float | None = None
     """CPU seconds allowed for each second of sequence; 1.0 when neither clock is given."""
-    method: Literal["isdf", "exact", "voxblox", "fiesta", "kinectfusion"] = "isdf"
-    """isdf: the neural field. exact: distances to sub-voxel surface points of a TSDF. voxblox, fiesta, kinectfusion:
-    the rivals that the paper names. The voxel methods need no steps and no more time than fusion takes."""
+    method: Literal["default", "isdf", "exact", "voxblox", "fiesta", "kinectfusion"] = "default"
+    """default: exact where the camera looked, guessed by a network elsewhere. isdf: the paper's neural field. exact:
+    distances to sub-voxel surface points of a TSDF. voxblox, fiesta, kinectfusion: the rivals that the paper names.
+    All but isdf need no steps and no more time than fusion takes."""
     voxel: float | None = None
     """Edge of a voxel of the voxel methods [m]; by default 0.04 (exact), 0.055 (voxblox, fiesta) and 0.07
     (kinectfusion)."""
@@ -93,7 +95,7 @@ class Map:
         if self.steps_per_frame is not None:
             return run_every_frame(sequence, config, self.steps_per_frame, watch)
         if self.steps_per_second is not None:
-            if not isinstance(config, MapperConfig):
+            if not isinstance(config, IsdfConfig):
                 raise ConfigError(
                     f"--steps-per-second belongs to --method isdf; {self.method} makes no steps"
                 )
@@ -107,13 +109,15 @@ class Map:
                 raise ConfigError(
                     f"--preset and --bound belong to --method isdf; leave them out for {self.method}"
                 )
-            config = VOXEL_METHODS[self.method]()
+            config: VoxelConfig | MapperConfig = VOXEL_METHODS.get(self.method, MapperConfig)()
+            if self.voxel is not None and self.method == "default":
+                raise ConfigError(f"--voxel belongs to the voxel methods: {', '.join(VOXEL_METHODS)}")
             return config if self.voxel is None else dataclasses.replace(config, voxel=self.voxel)
         if self.voxel is not None:
             raise ConfigError(
                 f"--voxel belongs to the voxel methods: add --method {' or '.join(VOXEL_METHODS)}"
             )
-        presets = {"cpu": MapperConfig(), "paper": MapperConfig.paper(), "released": MapperConfig.released()}
+        presets = {"cpu": IsdfConfig(), "paper": IsdfConfig.paper(), "released": IsdfConfig.released()}
         return dataclasses.replace(presets[self.preset], seed=self.seed, bound=self.bound)
 
     def _write(self, mapper: OnlineMapper, report: RunReport, sequence: DepthSequence) -> None:
@@ -128,7 +132,7 @@ class Map:
         mesh = zero_level_mesh(field, self.mesh_spacing, up=up)
         mesh.export(self.out / "mesh.ply")
         heights = list(self.slice_heights) or slice_heights(field, up)
-        frames = [] if isinstance(mapper, VoxelMapper) else mapper.keyframes.frames
+        frames = mapper.keyframes.frames if isinstance(mapper, IsdfMapper) else []
         keyframes = np.array([f.T_world_camera[:3, 3].numpy() for f in frames]).reshape(-1, 3)
         save_slices(self.out / "slices.png", field, heights, up, poses, keyframes)
         summary = dataclasses.asdict(report) | {

@@ -37,7 +37,7 @@ class Fit:
     out: Path
     """The YAML file to write; the picture gets the same name with .png."""
     budget: int = 200
-    """Greatest number of spheres. More protrude less: an arm takes 60 for 2-3 cm, 200-250 for under 1 cm."""
+    """Greatest number of spheres. More protrude less: an arm takes 60 for 2-3 cm, 240 for 1 cm at most."""
     gap: float = 0.001
     """How far geometry may stand out of the spheres [m]; cutting corners by a millimetre saves many spheres."""
     skip: tuple[str, ...] = ()

@@ -74,7 +74,7 @@ class Shape:
         """About `count` interior points (n, 3), uniform in the bounding box, and each piece's centroid."""
         points = np.stack([hull.centroid for hull in self.hulls])
         for _ in range(40):
-            drawn = self._rng.uniform(*self.bounds, (count, 3))
+            drawn = self._rng.uniform(self.bounds[0], self.bounds[1], (count, 3))
             points = np.concatenate([points, drawn[self.contains(drawn)]])[: max(count, len(self.hulls))]
             if len(points) >= count:
                 break

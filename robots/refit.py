@@ -47,7 +47,7 @@ def refit(name: str, save: bool = False) -> tuple[SphereSet, dict[str, SphereFit
         config = RobotFitConfig(static_factor=1.2)
         spheres, report = fit_robot(fetch_urdf(), 400, floor_links=["base_link"], config=config)
     elif name == "ur5":
-        spheres, report = fit_robot(ur5_urdf(), 140, floor_links=["base_link"])
+        spheres, report = fit_robot(ur5_urdf(), 180, floor_links=["base_link"])
     else:
         raise UnknownRobotError(f"no robot is called {name!r}; available: {', '.join(available())}")
     if save:

@@ -143,7 +143,7 @@ TIAGO_TUCKED = (0.15, 1.95, -1.50, 1.07, 2.29, 0.28, 0.93, 0.98)
 TIAGO_READY = (0.25, 2.18, 0.82, 1.34, 1.53, -0.44, 1.08, 0.68)
 PANDA_READY = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 FETCH_TUCKED = (0.1, 1.32, 1.4, -0.2, 1.72, 0.0, 1.66, 0.0)
-UR5_READY = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
+UR5_READY = (0.0, -1.0, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
 
 _LOADERS: dict[str, Callable[[], Robot]] = {
     "fetch": _load_fetch,

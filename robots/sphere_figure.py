@@ -30,25 +30,26 @@ def save_sphere_figure(path: str | Path, robot: Robot, q: Tensor | None = None) 
     centres, radii = robot.spheres(q)
     ball = trimesh.creation.icosphere(subdivisions=1)
     spheres = [ball.triangles * float(r) + c for c, r in zip(centres.numpy(), radii, strict=True)]
-    figure = Figure(figsize=(13, 7), layout="constrained")
-    for column, (elevation, azimuth) in enumerate(VIEWS):
+    figure = Figure(figsize=(11, 12), layout="constrained")
+    for row, (elevation, azimuth) in enumerate(VIEWS):
         for extra in (0, 1):
-            axes = figure.add_subplot(1, 4, 2 * column + extra + 1, projection="3d")
+            axes = figure.add_subplot(2, 2, 2 * row + extra + 1, projection="3d")
             assert isinstance(axes, Axes3D)
             axes.view_init(elevation, azimuth)
-            _draw(axes, hulls, HULL_COLOUR, 1.0)
+            axes.computed_zorder = False  # or whole collections hide one another: spheres go on top
+            _draw(axes, hulls, HULL_COLOUR, 1.0, 1)
             if extra:
-                _draw(axes, spheres, SPHERE_COLOUR, 0.25)
+                _draw(axes, spheres, SPHERE_COLOUR, 0.15, 2)
             axes.set_title(f"{len(radii)} spheres" if extra else "convex hulls", fontsize=10)
             _fit_axes(axes, np.concatenate([part.reshape(-1, 3) for part in hulls + spheres]))
     figure.suptitle(robot.name)
     figure.savefig(path, dpi=110)
 
 
-def _draw(axes: Axes3D, parts: list[np.ndarray], colour: str, opacity: float) -> None:
+def _draw(axes: Axes3D, parts: list[np.ndarray], colour: str, opacity: float, order: int) -> None:
     triangles = np.concatenate(parts)
     axes.add_collection3d(
-        Poly3DCollection(triangles, facecolors=colour, edgecolors="none", alpha=opacity, shade=True)
+        Poly3DCollection(triangles, facecolors=colour, alpha=opacity, shade=True, zorder=order)
     )
 
 

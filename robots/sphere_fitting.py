@@ -17,7 +17,8 @@ from robots.ball_cover import BallCover
 from robots.convex_shape import Shape
 from robots.errors import RobotError
 
-GROWTH_POINTS = 100_000  # surface points that the final radii must contain
+GROWTH_POINTS = 50_000  # surface points that the final radii must contain,
+GROWTH_ROUNDS = 8  # drawn anew so many times, or until all are contained
 MEASURED_POINTS = 10_000  # fresh surface points that coverage is measured on
 WORTHWHILE = 0.97  # another ball counts as a gain if it lowers the overshoot to this share
 PATIENCE = 20  # balls in a row without a gain after which a shape gets no more
@@ -99,9 +100,12 @@ class GrowingCover:
     def fit(self) -> SphereFit:
         """The spheres, balls that did not help left out, grown to what denser samples show, and measured."""
         self._cover.restart(self._best)
-        spheres = _grown_to(
-            self._cover.balls(), self.shape.surface_points(GROWTH_POINTS), self._lowest, self._gap
-        )
+        spheres = self._cover.balls()
+        for _ in range(GROWTH_ROUNDS):
+            points = self.shape.surface_points(GROWTH_POINTS)
+            if protruding(spheres, points).max() <= self._gap:
+                break
+            spheres = _grown_to(spheres, points, self._lowest, self._gap)
         return measure(spheres, self.shape)
 
 
@@ -140,8 +144,8 @@ def _grown_to(spheres: np.ndarray, points: np.ndarray, lowest: float, gap: float
     for point in points[protruding(spheres, points) > gap]:
         distances = np.linalg.norm(spheres[:, :3] - point, axis=1) - gap
         growth = distances - spheres[:, 3]
-        # Reaching below the height limit weighs thrice: it may cost growth elsewhere, but not any amount.
-        growth += 3.0 * (lowest - (spheres[:, 2] - distances)).clip(min=0)
+        # Reaching below the height limit weighs thirtyfold: it may cost growth elsewhere, but not any amount.
+        growth += 30.0 * (lowest - (spheres[:, 2] - distances)).clip(min=0)
         nearest = int(growth.argmin())
         spheres[nearest, 3] = max(spheres[nearest, 3], distances[nearest])
     return spheres
