@@ -1,7 +1,17 @@
 import pytest
 import torch
 
-from planning import ChompConfig, ConfigError, Planner, PlannerConfig, RrtConfig, Status, Trajectory, check
+from planning import (
+    ChompConfig,
+    ConfigError,
+    ObjectiveConfig,
+    Planner,
+    PlannerConfig,
+    RrtConfig,
+    Status,
+    Trajectory,
+    check,
+)
 from tests.planning.fields import Box, Cylinder, HalfSpace, HingeCost, NanBeyond, Sphere, Union, walls_round
 from tests.planning.robots import Base, Disc
 from tests.planning.test_initialise import TRAP
