@@ -1,8 +1,7 @@
 """How the sphere sets in `robots/data` are made; run again after a change of a robot or of the fitter.
 
 TIAGo's set was made by an earlier fitter. It is kept because navigation was tuned with it, and is coarser than what
-`refit("tiago")` returns. The UR5's was made with a budget of 140, which is too little: base and upper arm overlap by
-3 mm at rest, where their hulls are 14 mm apart. The Fetch's had its radii grown afterwards, as the fitter now does.
+`refit("tiago")` returns.
 """
 
 from __future__ import annotations
