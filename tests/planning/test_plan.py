@@ -35,7 +35,7 @@ def test_a_trap_is_left_with_the_help_of_the_search(field):
 
 def test_the_searched_path_is_returned_where_chomp_leaves_what_is_free():
     start, goal = torch.tensor([1.0, 0.0]), torch.tensor([4.0, 0.5])
-    careless = ObjectiveConfig(smoothness_weight=1.0, obstacle_weight=0.0)
+    careless = ObjectiveConfig(smoothness_weight=1.0, obstacle_weight=0.0, margin=-1.0)
     config = PlannerConfig(chomp=ChompConfig(objective=careless, max_tightenings=0, restarts=0))
     result = Planner(Disc(), config).plan(start, goal, TRAP)
     assert result.success and "not optimised" in result.message
