@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from examples.episode import Episode
 from planning.grid_search import GridSearchConfig, grid_search
+from planning.path_reference import wrapped
 from planning.tracking import BaseTracker, TrackerConfig
 
 ROUTE = GridSearchConfig(margin=0.3)
@@ -44,23 +45,33 @@ class Leg:
 class Gaze:
     """The direction of the camera, turned towards what is wanted as smoothly as a neck does it.
 
-    A critically damped second-order filter of azimuth and elevation, limited in speed.
+    A critically damped second-order filter of azimuth and elevation, limited in speed. What lies behind the robot is
+    looked at as far round as the neck goes, and when it passes from one side to the other, the camera swings over the
+    front.
 
     Args:
         yaw: azimuth to begin with [rad].
         frequency: of the filter [rad/s].
         max_rate: [rad/s].
+        reach: of the neck to each side [rad]; TIAGo's ends at 1.31.
     """
 
-    def __init__(self, yaw: float, frequency: float = 4.0, max_rate: float = 1.2) -> None:
+    def __init__(
+        self, yaw: float, frequency: float = 4.0, max_rate: float = 1.2, reach: float = 1.25
+    ) -> None:
         self._angles, self._rates = np.array([yaw, -0.3]), np.zeros(2)
-        self._frequency, self._max_rate = frequency, max_rate
+        self._frequency, self._max_rate, self._reach = frequency, max_rate, reach
 
-    def towards(self, ray: np.ndarray, period: float) -> np.ndarray:
-        """Direction (3,) after `period` [s] of turning towards a ray (3,) of any length."""
-        wanted = np.array([np.arctan2(ray[1], ray[0]), np.arctan2(ray[2], np.hypot(ray[0], ray[1]))])
-        gap = wanted - self._angles
-        gap[0] = (gap[0] + np.pi) % (2 * np.pi) - np.pi
+    def towards(self, ray: np.ndarray, yaw: float, period: float) -> np.ndarray:
+        """Direction (3,) after `period` [s] of turning towards a ray (3,) of any length on a base at `yaw` [rad]."""
+        aside = np.clip(wrapped(float(np.arctan2(ray[1], ray[0])) - yaw), -self._reach, self._reach)
+        # Differences of angles to the base's heading, so that the shorter way never leads over the back.
+        gap = np.array(
+            [
+                aside - wrapped(float(self._angles[0]) - yaw),
+                np.arctan2(ray[2], np.hypot(ray[0], ray[1])) - self._angles[1],
+            ]
+        )
         w = self._frequency
         self._rates += period * (w**2 * gap - 2 * w * self._rates)
         self._rates = np.clip(self._rates, -self._max_rate, self._max_rate)
@@ -132,7 +143,9 @@ class CameraTour:
     def _advance(self, leg: Leg, command: tuple[float, float]) -> None:
         period = 1 / self.fps
         eye = self.robot.camera.pose()[:3, 3]
-        self.robot.look_at(eye + 3.0 * self._gaze.towards(self._target(leg) - eye, period))
+        yaw = float(self.robot.base_state()[2])
+        direction = self._gaze.towards(self._target(leg) - eye, yaw, period)
+        self.robot.look_at(eye + 3.0 * direction)
         self.robot.drive(*command, period)
 
     def _target(self, leg: Leg) -> np.ndarray:

@@ -118,6 +118,11 @@ def photo(
         forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
         target = close_up
         eye = target - 0.5 * forward + 1.3 * left + np.array([0.0, 0.0, 0.7])
+    client = episode.world.client
+    if "ceiling" in episode.world.solids:
+        # Seen through from above; the depth camera, which draws no colours, still sees it.
+        ceiling = episode.world.body_id("ceiling")
+        pybullet.changeVisualShape(ceiling, -1, rgbaColor=[1, 1, 1, 0], physicsClientId=client)
     view = pybullet.computeViewMatrix(eye.tolist(), target.tolist(), [0, 0, 1])
     projection = pybullet.computeProjectionMatrixFOV(50, width / height, 0.1, 60)
     shown = pybullet.getCameraImage(
@@ -128,7 +133,7 @@ def photo(
         lightDirection=[2, -3, 6],
         flags=pybullet.ER_NO_SEGMENTATION_MASK,
         renderer=pybullet.ER_TINY_RENDERER,
-        physicsClientId=episode.world.client,
+        physicsClientId=client,
     )
     return np.reshape(shown[2], (height, width, 4))[:, :, :3].astype(np.uint8)
 

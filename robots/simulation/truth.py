@@ -91,12 +91,13 @@ def _solid(path: Path, index: int, entry: Any) -> Primitive:
     if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
         raise SceneError(f"{path}: solid {index} must be an object with a name, got {str(entry)[:80]!r}")
     where = f"{path}: solid {entry['name']!r}"
-    if entry.get("kind") not in SIZES:
-        raise SceneError(f"{where}: kind must be one of {', '.join(SIZES)}, got {entry.get('kind')!r}")
-    make, sizes = SIZES[entry["kind"]]
+    kind = entry.get("kind")
+    if not isinstance(kind, str) or kind not in SIZES:
+        raise SceneError(f"{where}: kind must be one of {', '.join(SIZES)}, got {kind!r}")
+    make, sizes = SIZES[kind]
     missing = [name for name in ("pose", *sizes) if name not in entry]
     if missing:
-        raise SceneError(f"{where}: a {entry['kind']} needs {', '.join(missing)}")
+        raise SceneError(f"{where}: a {kind} needs {', '.join(missing)}")
     pose = _numbers(where, "pose", entry["pose"], (4, 4))
     read = {name: _numbers(where, name, entry[name], (3,) if name == "size" else ()) for name in sizes}
     try:
@@ -124,6 +125,6 @@ def _numbers(where: str, name: str, value: Any, shape: tuple[int, ...]) -> np.nd
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
-        size = " x ".join(map(str, shape)) or "one"
-        raise SceneError(f"{where}: {name} must be {size} finite numbers, got {str(value)[:80]}")
+        wanted = f"{' x '.join(map(str, shape))} finite numbers" if shape else "one finite number"
+        raise SceneError(f"{where}: {name} must be {wanted}, got {str(value)[:80]}")
     return array

@@ -16,19 +16,21 @@ from robots.simulation import load_truth
 SHORT = HomeTour("home_1", (-0.4, -1.1, -0.4), (Leg(((-0.1, -1.2),), "grasp_object", linger=0.3),))
 
 
-@pytest.fixture(autouse=True)
-def _short_tours(monkeypatch):
-    monkeypatch.setitem(TOURS, "short", SHORT)
+@pytest.fixture(autouse=True, scope="module")
+def _short_tours():
     threads = torch.get_num_threads()
-    yield
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(TOURS, "short", SHORT)
+        yield
     torch.set_num_threads(threads)
 
 
-@pytest.fixture
-def folder(tmp_path):
-    counts = record_sequences.main(RecordSequences(tmp_path, only=("short",), width=64))
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sequences")
+    counts = record_sequences.main(RecordSequences(out, only=("short",), width=64))
     assert list(counts) == ["short"] and counts["short"] > 20
-    return tmp_path / "short"
+    return out / "short"
 
 
 def test_frames_agree_with_the_truth(folder) -> None:

@@ -42,6 +42,10 @@ def edited(values: dict, change: str) -> object:
         values["room"].reverse()
     elif change == "unknown kind":
         solid["kind"] = "cone"
+    elif change == "kinds":
+        solid["kind"] = ["box"]
+    elif change == "no radius":
+        solid.update(kind="sphere", radius="big")
     elif change == "no pose":
         del solid["pose"]
     elif change == "short pose":
@@ -65,6 +69,8 @@ def edited(values: dict, change: str) -> object:
         ("a list", "keys room and solids"),
         ("room upside down", "lower corner and then its upper"),
         ("unknown kind", "solid 'floor': kind must be one of box, cylinder, sphere, got 'cone'"),
+        ("kinds", "kind must be one of box, cylinder, sphere, got \\['box'\\]"),
+        ("no radius", "radius must be one finite number, got big"),
         ("no pose", "solid 'floor': a box needs pose"),
         ("short pose", "pose must be 4 x 4 finite numbers"),
         ("nan size", "size must be 3 finite numbers"),
