@@ -41,6 +41,7 @@ class FloorPlan(NamedTuple):
 def draw(
     field: Any,
     spacing: float,
+    padding: float,
     up: Float[np.ndarray, "3"],
     band: tuple[float, float],
     progress: Callable[[int, int], None],
@@ -53,6 +54,7 @@ def draw(
     Args:
         field: a distance field with `bounds`.
         spacing: edge of a cell [m].
+        padding: added around what was observed [m]: walls may lie on its very edge.
         up: unit vector.
         band: lowest and highest height [m] along `up`.
         progress: told how many heights of all are done.
@@ -62,7 +64,7 @@ def draw(
     """
     basis = slice_basis(up)
     along = corners(field.bounds.cpu().numpy()) @ basis.T
-    low, high = along.min(axis=0)[:2], along.max(axis=0)[:2]
+    low, high = along.min(axis=0)[:2] - padding, along.max(axis=0)[:2] + padding
     columns, rows = np.ceil((high - low) / spacing)
     heights = np.linspace(*band, int(min(np.ceil((band[1] - band[0]) / spacing), MAX_CELLS)) + 1)
     if not rows * columns * len(heights) <= 60 * MAX_CELLS or not rows * columns <= MAX_CELLS:

@@ -126,7 +126,7 @@ def _point_cloud(
 def _ros_map(
     field: Any, path: Path, config: ExportConfig, header: dict, progress: Progress
 ) -> dict[str, Any]:
-    plan = floor_plan.draw(field, config.spacing, _unit(config.up), config.band, progress)
+    plan = floor_plan.draw(field, config.spacing, config.padding, _unit(config.up), config.band, progress)
     files = floor_plan.write_ros_map(path, plan)
     counts = {name: int((plan.cells == value).sum()) for name, value in floor_plan.VALUES.items()}
     return {"files": [str(file) for file in files], "shape": list(plan.cells.shape), "cells": counts}

@@ -113,6 +113,8 @@ def test_a_floor_plan_tells_occupied_free_and_unknown(tmp_path) -> None:
     assert state_at(plan, 1.1, 0.5) == "occupied"  # the table
     assert state_at(plan, -0.6, -1.0) == "occupied"  # the ball
     assert state_at(plan, -1.4, 0.3) == "free"
+    for wall in ((-2.52, -0.5), (2.52, -0.5), (0.0, -2.02), (1.0, 2.02)):
+        assert state_at(plan, *wall) == "occupied"
     assert state_at(plan, -2.1, 1.4) != "free"  # within the cupboard, which no camera saw
     export(room(), tmp_path / "q.yaml", "ros-map", ExportConfig(band=(0.85, 1.1)))
     assert state_at(read_plan(tmp_path / "q.yaml"), 1.1, 0.5) == "free"  # over the table
@@ -124,7 +126,9 @@ def test_a_floor_plan_follows_up(tmp_path) -> None:
     pole = (n[:, None] - 1.0).square() + (n[None] + 0.5).square()  # along y, at x = 1, z = -0.5
     values = pole.sqrt()[:, None].expand(41, 41, 41) - 0.2
     field = GridField(values.contiguous(), torch.tensor([-2.0, -2.0, -2.0]), 0.1)
-    report = export(field, tmp_path / "p.yaml", "ros-map", ExportConfig(up=(0.0, -1.0, 0.0), band=(0.0, 1.0)))
+    report = export(
+        field, tmp_path / "p.yaml", "ros-map", ExportConfig(padding=0.0, up=(0.0, -1.0, 0.0), band=(0.0, 1.0))
+    )
     assert report["cells"]["unknown"] == 0
     comment = (tmp_path / "p.yaml").read_text().splitlines()[0]
     basis = np.array([[float(w) for w in part.split()[-3:]] for part in comment.split("; ")])
