@@ -79,26 +79,39 @@ def test_kill_9_loses_at_most_the_period_and_never_the_file(kills, method, tmp_p
         seen = mapper.frames_seen
         left += len([p for p in out.iterdir() if p != path])
         assert len([p for p in out.iterdir() if p != path]) <= 1, "litter of earlier kills stays"
-    print(
-        f"{kills} kills: median loss {np.median(losses):.2f} s, worst {max(losses):.2f} s, {left} during a save"
+    record_property(
+        "losses",
+        f"{kills} kills: median loss {np.median(losses):.2f} s, worst {max(losses):.2f} s, {left} during a save",
     )
     # The machine may be busy with other things for a moment.
     assert max(losses) < EVERY + 0.5 and np.median(losses) < EVERY
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_stopped_run_goes_on_and_ends_as_if_it_had_not_been(
-    number, code, tmp_path, monkeypatch, capsys
-) -> None:
-    sequence, out = recorded(tmp_path / "room", 60), tmp_path / "run"
-    words = (sequence, "--steps-per-frame", 4, "--mesh-spacing", 0.1)
-    process = start(*words, "--out", out)
+def test_a_stopped_run_leaves_a_checkpoint_and_says_how_to_go_on(number, code, tmp_path) -> None:
+    sequence, out = recorded(tmp_path / "room", 400), tmp_path / "run"
+    process = start(sequence, "--out", out, "--steps-per-frame", 2)
     wait_for(out / "map.safetensors", process)
     process.send_signal(number)
     _, error = process.communicate(timeout=60)
     assert process.returncode == code and f"isdf map --resume {out}" in error
     assert sorted(p.name for p in out.iterdir()) == ["map.safetensors"]
-    assert 0 < load_map(out / "map.safetensors").frames_seen < 60
+    assert 0 < load_map(out / "map.safetensors").frames_seen < 400
+
+
+def test_a_resumed_run_ends_as_if_it_had_not_been_stopped(tmp_path, monkeypatch, capsys) -> None:
+    sequence, out, report = recorded(tmp_path / "room", 12), tmp_path / "run", RunReport()
+    words = (sequence, "--steps-per-frame", 4, "--mesh-spacing", 0.2)
+    options = {"sequence_dir": str(sequence), "steps_per_frame": 4, "mesh_spacing": 0.2}
+    watch = Checkpointer(out / "map.safetensors", 1e-9, report, options, lambda *_: None)
+
+    def stop(mapper: object, arrived: int) -> None:
+        watch(mapper, arrived)
+        if arrived == 5:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        run_every_frame(RecordedSequence(sequence), MapperConfig(), 4, stop, Begun(report))
     for line in (("--resume", out), (*words, "--out", tmp_path / "whole")):
         monkeypatch.setattr("sys.argv", ["isdf", "map", *map(str, line), "--json"])
         main()
