@@ -29,3 +29,7 @@ class CheckpointError(IsdfError):
 
 class NotReadyError(IsdfError):
     """The map was asked for something it can only give after a first frame."""
+
+
+class BackgroundError(IsdfError):
+    """The background mapper has failed, by the error this one was raised from, or is closed."""
