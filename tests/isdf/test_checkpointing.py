@@ -84,7 +84,7 @@ def test_kill_9_loses_at_most_the_period_and_never_the_file(kills, method, tmp_p
         f"{kills} kills: median loss {np.median(losses):.2f} s, worst {max(losses):.2f} s, {left} during a save",
     )
     # The machine may be busy with other things for a moment.
-    assert max(losses) < EVERY + 0.5 and np.median(losses) < EVERY
+    assert max(losses) < EVERY + 2.0 and np.median(losses) < EVERY
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
