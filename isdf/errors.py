@@ -33,3 +33,7 @@ class NotReadyError(IsdfError):
 
 class BackgroundError(IsdfError):
     """The background mapper has failed, by the error this one was raised from, or is closed."""
+
+
+class EvaluationError(IsdfError):
+    """A map cannot be judged: its answers are not numbers, or there is nothing to judge it by."""

@@ -41,7 +41,7 @@ class DepthFrame:
 
     # Written by hand so that numpy images and foreign cameras are converted before anything is stored.
     def __init__(self, depth: Any, T_world_camera: Any, camera: Any, time: float = 0.0) -> None:
-        camera = _as_camera(camera)
+        camera = as_camera(camera)
         object.__setattr__(self, "camera", camera)
         object.__setattr__(self, "depth", _as_depth(depth, camera))
         object.__setattr__(self, "T_world_camera", _as_rigid(T_world_camera))
@@ -74,7 +74,8 @@ class DepthFrame:
         return points @ T[:3, :3].T + T[:3, 3]
 
 
-def _as_camera(camera: Any) -> PinholeCamera:
+def as_camera(camera: Any) -> PinholeCamera:
+    """The camera itself, or one made of any object with its attributes; FrameError where it has not all of them."""
     if isinstance(camera, PinholeCamera):
         return camera
     names = ("fx", "fy", "cx", "cy", "width", "height")

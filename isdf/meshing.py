@@ -67,7 +67,7 @@ def _march(grid: GridField, observed: np.ndarray | None, up: np.ndarray) -> trim
         return trimesh.Trimesh()
     try:
         vertices, faces, _, _ = marching_cubes(
-            values, level=0.0, spacing=(grid.spacing,) * 3, gradient_direction="ascent", mask=observed
+            values, level=0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent", mask=observed
         )
     except RuntimeError:  # no crossing in any of the observed cells
         return trimesh.Trimesh()

@@ -9,14 +9,34 @@ import torch
 from . import checkpoint, mapfile
 from .errors import CheckpointError, ConfigError
 from .mapper import Mapper, MapperConfig
-from .voxel import ExactConfig, ExactMapper, KinectFusionConfig, KinectFusionMapper, VoxelMapper
+from .voxel import (
+    ExactConfig,
+    ExactMapper,
+    FiestaConfig,
+    FiestaMapper,
+    KinectFusionConfig,
+    KinectFusionMapper,
+    VoxbloxConfig,
+    VoxbloxMapper,
+    VoxelMapper,
+)
 
-Config = MapperConfig | ExactConfig | KinectFusionConfig
-OnlineMapper = Mapper | ExactMapper | KinectFusionMapper
+VoxelConfig = ExactConfig | VoxbloxConfig | FiestaConfig | KinectFusionConfig
+Config = MapperConfig | VoxelConfig
+OnlineMapper = Mapper | ExactMapper | VoxbloxMapper | FiestaMapper | KinectFusionMapper
 
-_FORMATS: dict[str, type[Mapper] | type[ExactMapper] | type[KinectFusionMapper]] = {
+_MAPPERS: dict[type, type[OnlineMapper]] = {
+    MapperConfig: Mapper,
+    ExactConfig: ExactMapper,
+    VoxbloxConfig: VoxbloxMapper,
+    FiestaConfig: FiestaMapper,
+    KinectFusionConfig: KinectFusionMapper,
+}
+_FORMATS: dict[str, type[OnlineMapper]] = {
     checkpoint.FORMAT: Mapper,
     ExactMapper.FORMAT: ExactMapper,
+    VoxbloxMapper.FORMAT: VoxbloxMapper,
+    FiestaMapper.FORMAT: FiestaMapper,
     KinectFusionMapper.FORMAT: KinectFusionMapper,
 }
 
@@ -27,15 +47,11 @@ def new_mapper(config: Config) -> OnlineMapper:
     Raises:
         ConfigError: it is none of the methods' configurations.
     """
-    if isinstance(config, MapperConfig):
-        return Mapper(config)
-    if isinstance(config, ExactConfig):
-        return ExactMapper(config)
-    if isinstance(config, KinectFusionConfig):
-        return KinectFusionMapper(config)
-    raise ConfigError(
-        f"no method has a {type(config).__name__}; pass a MapperConfig, ExactConfig or KinectFusionConfig"
-    )
+    if type(config) not in _MAPPERS:
+        raise ConfigError(
+            f"no method has a {type(config).__name__}; pass a {', '.join(c.__name__ for c in _MAPPERS)}"
+        )
+    return _MAPPERS[type(config)](config)  # type: ignore[arg-type]
 
 
 def load_map(path: str | Path, device: str | torch.device = "cpu") -> OnlineMapper:

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from .slice_geometry import corners, slice_basis
 
@@ -42,22 +43,24 @@ def draw_slice(
     poses: Float[np.ndarray, "n 4 4"] | None = None,
     keyframes: Float[np.ndarray, "k 3"] | None = None,
     spacing: float = 0.02,
+    bounds: Float[Tensor, "2 3"] | None = None,
+    grey_unknown: bool = True,
 ) -> Any:
     """Draw one slice into matplotlib axes; returns the image for a colour bar.
 
-    Where the field has a `confidence` and it is below one half, the slice is grey.
-
     Args:
         axes: where to draw; in metres along the two horizontal directions of `slice_basis(up)`.
-        field: a distance field with `bounds`.
+        field: a distance field; with `bounds`, unless these are given.
         height: along `up` [m].
         up: unit vector.
         poses: T_world_camera of the whole path, drawn as a line.
         keyframes: camera positions to mark [m].
         spacing: size of a picture element [m].
+        bounds: (2, 3) region [m]; by default the field's.
+        grey_unknown: draw grey where the field's `confidence`, if it has one, is below one half.
     """
     basis = slice_basis(up)
-    box = corners(field.bounds.cpu().numpy()) @ basis.T
+    box = corners((field.bounds if bounds is None else bounds).cpu().numpy()) @ basis.T
     (x0, y0, _), (x1, y1, _) = box.min(axis=0) - 0.2, box.max(axis=0) + 0.2
     xs, ys = np.arange(x0, x1, spacing), np.arange(y0, y1, spacing)
     grid = (
@@ -65,7 +68,7 @@ def draw_slice(
     )
     points = torch.from_numpy(grid.astype(np.float32))
     distance = field.distance(points).cpu().numpy()
-    if hasattr(field, "confidence"):
+    if grey_unknown and hasattr(field, "confidence"):
         distance = np.where(field.confidence(points).cpu().numpy() >= 0.5, distance, np.nan)
     image = axes.imshow(
         distance,

@@ -17,6 +17,7 @@ from PIL import Image
 
 from ..camera import PinholeCamera
 from ..errors import DatasetError
+from ..frames import as_camera
 from .sequence import DEFAULT_FPS, ImageSequence
 
 MAX_DEPTH_VALUE = 65535
@@ -59,20 +60,20 @@ class SequenceWriter:
 
     Args:
         folder: made if missing; must not hold a sequence already.
-        camera: intrinsics of every frame.
+        camera: intrinsics of every frame, a PinholeCamera or any object with its attributes.
         fps: frames a second.
         depth_scale: values a metre; 5000 keeps 0.2 mm and reaches 13 m.
     """
 
     def __init__(
-        self, folder: str | Path, camera: PinholeCamera, fps: float = DEFAULT_FPS, depth_scale: float = 5000.0
+        self, folder: str | Path, camera: Any, fps: float = DEFAULT_FPS, depth_scale: float = 5000.0
     ) -> None:
-        self.folder, self.camera, self.depth_scale = Path(folder), camera, depth_scale
+        self.folder, self.camera, self.depth_scale = Path(folder), as_camera(camera), depth_scale
         if (self.folder / "poses.txt").exists():
             raise DatasetError(f"{self.folder} already holds a sequence; choose an empty folder")
         (self.folder / "depth").mkdir(parents=True, exist_ok=True)
         names = ("fx", "fy", "cx", "cy", "width", "height")
-        values = {n: getattr(camera, n) for n in names} | {"depth_scale": depth_scale, "fps": fps}
+        values = {n: getattr(self.camera, n) for n in names} | {"depth_scale": depth_scale, "fps": fps}
         (self.folder / "intrinsics.json").write_text(json.dumps(values, indent=1) + "\n")
         (self.folder / "poses.txt").write_text(
             "# frame T_world_camera (4x4 row-major, OpenCV axes, metres)\n"

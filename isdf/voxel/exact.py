@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..errors import ConfigError
 from ..frames import DepthFrame
 from .mapper import VoxelMapper, check_period
 from .nearest_seed import NearestSeedField
+from .projection import tiny_frame
 from .surface import surface_seeds
 from .tsdf import TsdfConfig, TsdfVolume
 
@@ -50,6 +52,7 @@ class ExactMapper(VoxelMapper):
     def __init__(self, config: ExactConfig | None = None) -> None:
         config = config or ExactConfig()
         super().__init__(config, TsdfVolume(config))
+        _compile()
 
     @classmethod
     def config_type(cls) -> type:
@@ -88,3 +91,9 @@ class ExactMapper(VoxelMapper):
             patch=self.config.patch * volume.voxel,
             bounds=self._bounds,
         )
+
+
+@functools.cache
+def _compile() -> None:
+    """Compile what runs later, so that no frame waits for it."""
+    TsdfVolume(TsdfConfig()).fuse(tiny_frame())

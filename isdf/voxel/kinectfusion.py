@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from numba import njit
 from scipy.ndimage import distance_transform_edt
-from torch import Tensor
 
 from ..errors import ConfigError
-from ..field import GridField, check_points
 from ..frames import DepthFrame
 from .mapper import VoxelMapper, check_period
-from .nearest_seed import observed_at
+from .projection import pixel_of, projection, tiny_frame
 from .volume import GrowingVolume, usable_depth
+from .voxel_field import VoxelField
 
 # Bounds of the evidence of a voxel, in log odds: few contrary measurements can turn it.
 LOG_ODDS_LIMITS = (-2.0, 3.5)
+CHANNELS: dict[str, type[np.generic]] = {"log_odds": np.float32, "observed": np.float32}
 
 
 @dataclass(frozen=True)
@@ -55,41 +57,6 @@ class KinectFusionConfig:
         check_period(self.rebuild_period)
 
 
-class OccupancyField:
-    """Trilinear distances of an occupancy grid, and what of it was observed; immutable.
-
-    Args:
-        grid: distances at the voxel centres.
-        observed: of the same shape.
-        bounds: (2, 3) lower and upper corner of what was observed [m].
-    """
-
-    def __init__(
-        self, grid: GridField, observed: Bool[Tensor, "nx ny nz"], bounds: Float[Tensor, "2 3"]
-    ) -> None:
-        self._grid, self._observed, self.bounds = grid, observed, bounds.clone()
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the grids [bytes]."""
-        return self._grid.values.nbytes + self._grid._volume.nbytes + self._observed.nbytes
-
-    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Signed distance [m] at world points [m], positive outside; differentiable by autograd."""
-        return self._grid.distance(points)
-
-    def distance_and_gradient(
-        self, points: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Signed distance [m] and the gradient of its interpolant; no autograd graph."""
-        return self._grid.distance_and_gradient(points)
-
-    def confidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """1 where the voxel of a world point [m] was observed, 0 elsewhere."""
-        check_points(points)
-        return observed_at(self._observed, self._grid.origin, self._grid.spacing, points)
-
-
 class KinectFusionMapper(VoxelMapper):
     """Occupancy grid, then the distance to the occupied minus the distance to the free voxels (paper, appendix).
 
@@ -105,14 +72,15 @@ class KinectFusionMapper(VoxelMapper):
 
     def __init__(self, config: KinectFusionConfig | None = None) -> None:
         config = config or KinectFusionConfig()
-        super().__init__(config, GrowingVolume(config.voxel, ("log_odds", "observed"), config.max_voxels))
+        super().__init__(config, GrowingVolume(config.voxel, CHANNELS, config.max_voxels))
+        _compile()
 
     @classmethod
     def config_type(cls) -> type:
         """`KinectFusionConfig`."""
         return KinectFusionConfig
 
-    def field(self) -> OccupancyField:
+    def field(self) -> VoxelField:
         """An immutable snapshot of the distance field, at most `rebuild_period` of frame time old.
 
         Raises:
@@ -121,24 +89,72 @@ class KinectFusionMapper(VoxelMapper):
         return super().field()
 
     def _fuse(self, frame: DepthFrame) -> None:
-        config, volume = self.config, self.volume
-        depth = usable_depth(frame, config.max_depth)
-        behind = config.behind * config.voxel
-        begin, end = volume.include_frame(frame, np.where(depth > 0, depth + behind, 0))
-        log_odds, observed = (volume.channels[name].reshape(-1) for name in ("log_odds", "observed"))
-        for index, z, measured in volume.sights(frame, depth, begin, end):
-            ahead = measured - z
-            near = np.flatnonzero(ahead > -behind)
-            index, ahead = index[near], ahead[near]
-            evidence = np.where(ahead < config.front * config.voxel, config.hit, -config.miss)
-            log_odds[index] = np.clip(log_odds[index] + evidence, *LOG_ODDS_LIMITS)
-            observed[index] = 1
+        fuse(frame, self.volume, self.config)
 
-    def _rebuild(self) -> OccupancyField | None:
+    def _rebuild(self) -> VoxelField | None:
         occupied = self.volume.channels["log_odds"] > 0
         if not occupied.any():
             return None
         voxels = distance_transform_edt(~occupied) - distance_transform_edt(occupied)
-        values = torch.from_numpy((voxels * self.volume.voxel).astype(np.float32))
-        grid = GridField(values, torch.from_numpy(self.volume.origin.astype(np.float32)), self.volume.voxel)
-        return OccupancyField(grid, torch.from_numpy(self.volume.channels["observed"] > 0), self._bounds)
+        return VoxelField(
+            torch.from_numpy((voxels * self.volume.voxel).astype(np.float32)),
+            torch.from_numpy(self.volume.channels["observed"] > 0),
+            torch.from_numpy(self.volume.origin.astype(np.float32)),
+            self.volume.voxel,
+            self._bounds,
+        )
+
+
+def fuse(frame: DepthFrame, volume: GrowingVolume, config: KinectFusionConfig) -> None:
+    """Add the evidence of one frame to the channels `log_odds` and `observed`.
+
+    Raises:
+        FrameError: nothing within `max_depth`, or the volume would grow too large; nothing has changed.
+    """
+    depth = usable_depth(frame, config.max_depth)
+    behind = config.behind * config.voxel
+    begin, end = volume.include_frame(frame, np.where(depth > 0, depth + behind, 0))
+    weigh(
+        projection(frame, volume, begin, end),
+        np.ascontiguousarray(depth, dtype=np.float32).reshape(-1),
+        np.array([config.front * config.voxel, behind], dtype=np.float32),
+        (float(config.hit), float(config.miss)),
+        volume.channels["log_odds"],
+        volume.channels["observed"],
+    )
+
+
+@njit(cache=True)
+@no_type_check
+def weigh(view, depth, reach, evidence, log_odds, observed):
+    """Add the evidence of the surface that a voxel's pixel shows.
+
+    Args:
+        view: `Projection` of the voxels that can have changed.
+        depth: flat float32 z-depth of every pixel [m], 0 where unknown.
+        reach: (2,) float32, how far before and behind a surface a voxel is hit [m].
+        evidence: log odds of a hit, and those that a miss takes away.
+        log_odds: (nx, ny, nz) float32, changed in place.
+        observed: (nx, ny, nz) float32, set to 1.
+    """
+    least, greatest = LOG_ODDS_LIMITS
+    for i in range(view.x.shape[1]):
+        for j in range(view.y.shape[1]):
+            for k in range(view.z.shape[1]):
+                pixel, z = pixel_of(view, i, j, k)
+                if pixel < 0 or depth[pixel] <= 0:
+                    continue
+                ahead = depth[pixel] - z
+                if not ahead > -reach[1]:
+                    continue
+                at = (view.begin[0] + i, view.begin[1] + j, view.begin[2] + k)
+                gain = evidence[0] if ahead < reach[0] else -evidence[1]
+                log_odds[at] = min(max(log_odds[at] + gain, least), greatest)
+                observed[at] = 1
+
+
+@functools.cache
+def _compile() -> None:
+    """Compile what runs later, so that no frame waits for it."""
+    config = KinectFusionConfig()
+    fuse(tiny_frame(), GrowingVolume(config.voxel, CHANNELS, config.max_voxels), config)

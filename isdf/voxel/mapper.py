@@ -53,6 +53,17 @@ class VoxelMapper(abc.ABC):
     def _rebuild(self) -> Any:
         """A new field of the volume as it is, or None while it holds no surface."""
 
+    def _check_channels(self) -> None:
+        """Refuse channels, as read from a file, that do not belong together; methods that keep more than the channels
+        make the rest anew.
+
+        Raises:
+            CheckpointError: says which.
+        """
+        shapes = {name: values.shape for name, values in self.volume.channels.items()}
+        if len(set(shapes.values())) != 1 or any(len(shape) != 3 for shape in shapes.values()):
+            raise CheckpointError(f"channels must be of one shape of 3 axes, got {shapes}")
+
     @property
     def bounds(self) -> Float[Tensor, "2 3"]:
         """Lower and upper corner [m] of the surfaces and cameras seen so far; NotReadyError before the first."""
@@ -153,12 +164,13 @@ class VoxelMapper(abc.ABC):
     def _restored(cls, tensors: dict[str, Tensor], header: dict[str, Any]) -> VoxelMapper:
         mapper = cls(cls.config_type()(**header["config"]))  # type: ignore[call-arg]
         volume = mapper.volume
-        channels = {name: tensors[name].numpy() for name in volume.channels}
-        shapes = {name: values.shape for name, values in channels.items()}
-        if len(set(shapes.values())) != 1 or any(values.dtype != np.float32 for values in channels.values()):
-            raise CheckpointError(f"channels must be float32 of one shape, got {shapes}")
-        volume.channels = channels
+        for name, empty in volume.channels.items():
+            values = tensors[name].numpy()
+            if values.dtype != empty.dtype:
+                raise CheckpointError(f"channel {name} must be {empty.dtype}, got {values.dtype}")
+            volume.channels[name] = values
         volume.corner = np.array(header["corner"], dtype=np.int64).reshape(3)
+        mapper._check_channels()
         mapper._bounds = tensors["bounds"].reshape(2, 3)
         mapper.frames_seen, rebuilt = int(header["frames_seen"]), header["rebuilt_at"]
         mapper._fresh = False

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 from ..errors import ConfigError
 from ..frames import DepthFrame
+from .projection import pixel_of, projection
 from .volume import GrowingVolume, usable_depth
 
 # Nearer than this [m] the noise of depth cameras no longer falls with the square of the depth.
@@ -63,7 +66,7 @@ class TsdfVolume(GrowingVolume):
     """
 
     def __init__(self, config: TsdfConfig) -> None:
-        super().__init__(config.voxel, ("distance", "weight"), config.max_voxels)
+        super().__init__(config.voxel, {"distance": np.float32, "weight": np.float32}, config.max_voxels)
         self.config = config
 
     @property
@@ -84,16 +87,42 @@ class TsdfVolume(GrowingVolume):
         """
         config = self.config
         depth = usable_depth(frame, config.max_depth)
-        begin, end = self.include_frame(frame, np.where(depth > 0, depth + config.band(depth), 0))
-        distances, weights = self.distance.reshape(-1), self.weight.reshape(-1)
-        for index, z, measured in self.sights(frame, depth, begin, end):
-            band, ahead = config.band(measured), measured - z
-            near = np.flatnonzero(ahead > -band)
-            index, band, ahead, measured = index[near], band[near], ahead[near], measured[near]
-            weight = np.maximum(measured, NOISE_FLOOR_DEPTH) ** -4
-            # Behind a surface less and less is known, and what is there may be seen from its other side.
-            weight *= np.clip((ahead + band) / (band - self.voxel), 0, 1)
-            before = weights[index]
-            total = before + weight
-            distances[index] = (distances[index] * before + np.minimum(ahead, band) * weight) / total
-            weights[index] = np.minimum(total, config.max_weight)
+        band = config.band(depth)
+        begin, end = self.include_frame(frame, np.where(depth > 0, depth + band, 0))
+        gain = np.maximum(depth, NOISE_FLOOR_DEPTH) ** -4
+        images = tuple(np.ascontiguousarray(a, dtype=np.float32).reshape(-1) for a in (depth, band, gain))
+        limits = np.array([self.voxel, config.max_weight], dtype=np.float32)
+        average(projection(frame, self, begin, end), images, limits, self.distance, self.weight)
+
+
+@njit(cache=True)
+@no_type_check
+def average(view, images, limits, distances, weights):
+    """Put the distance to the surface that a voxel's pixel shows into the voxel's weighted mean.
+
+    Args:
+        view: `Projection` of the voxels that can have changed.
+        images: flat float32 depth [m] (0 where unknown), truncation [m] and weight of every pixel.
+        limits: (2,) float32, edge of a voxel [m] and greatest weight.
+        distances: (nx, ny, nz) float32, changed in place.
+        weights: (nx, ny, nz) float32, changed in place.
+    """
+    depth, bands, gains = images
+    voxel, most = limits
+    zero, one = np.float32(0), np.float32(1)
+    for i in range(view.x.shape[1]):
+        for j in range(view.y.shape[1]):
+            for k in range(view.z.shape[1]):
+                pixel, z = pixel_of(view, i, j, k)
+                if pixel < 0 or depth[pixel] <= zero:
+                    continue
+                band, ahead = bands[pixel], depth[pixel] - z
+                if not ahead > -band:
+                    continue
+                # Behind a surface less and less is known, and what is there may be seen from its other side.
+                weight = gains[pixel] * min(max((ahead + band) / (band - voxel), zero), one)
+                at = (view.begin[0] + i, view.begin[1] + j, view.begin[2] + k)
+                before = weights[at]
+                total = before + weight
+                distances[at] = (distances[at] * before + min(ahead, band) * weight) / total
+                weights[at] = min(total, most)

@@ -11,6 +11,7 @@ from robots.simulation.rooms import GraspTask
 from robots.simulation.scene_sdf import SceneField
 from robots.simulation.scenes import Scene, available_scenes, load_urdf_scene, make_scene
 from robots.simulation.simulated_robot import MotorConfig, SimulatedRobot
+from robots.simulation.truth import Truth, load_truth, save_truth
 from robots.simulation.world import World
 
 __all__ = [
@@ -33,8 +34,11 @@ __all__ = [
     "SimulatedMobileRobot",
     "SimulatedRobot",
     "Sphere",
+    "Truth",
     "World",
     "available_scenes",
+    "load_truth",
     "load_urdf_scene",
     "make_scene",
+    "save_truth",
 ]

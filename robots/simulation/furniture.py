@@ -185,6 +185,67 @@ def bed(name: str) -> Parts:
     )
 
 
+def stool(name: str) -> Parts:
+    """Build a bar stool 0.65 m high: seat, column and foot."""
+    return (
+        Cylinder(f"{name}.seat", planar_pose(0, 0, 0.62), 0.17, 0.06, colour=DARK_WOOD),
+        Cylinder(f"{name}.column", planar_pose(0, 0, 0.31), 0.03, 0.56, colour=METAL),
+        Cylinder(f"{name}.foot", planar_pose(0, 0, 0.015), 0.17, 0.03, colour=METAL),
+    )
+
+
+def island(name: str, width: float) -> Parts:
+    """Build a kitchen island 0.9 m high whose worktop of 0.6 m juts out over its -y side."""
+    return (
+        _box(f"{name}.body", (width - 0.1, 0.4, 0.86), 0.0, 0.08, 0.0, WHITE),
+        _box(f"{name}.worktop", (width, 0.6, 0.04), 0.0, 0.0, 0.86, DARK_WOOD),
+    )
+
+
+def table_lamp(name: str) -> Parts:
+    """Build a lamp 0.45 m high with its own bottom at z = 0, to stand on a piece."""
+    return (
+        Cylinder(f"{name}.foot", planar_pose(0, 0, 0.01), 0.07, 0.02, colour=GREY),
+        Cylinder(f"{name}.rod", planar_pose(0, 0, 0.135), 0.012, 0.23, colour=METAL),
+        Cylinder(f"{name}.shade", planar_pose(0, 0, 0.35), 0.12, 0.2, colour=(0.95, 0.9, 0.7)),
+    )
+
+
+def vase(name: str) -> Parts:
+    """Build a vase with a ball of flowers, its own bottom at z = 0, to stand on a piece."""
+    return (
+        Cylinder(f"{name}.pot", planar_pose(0, 0, 0.1), 0.05, 0.2, colour=BLUE),
+        Sphere(f"{name}.flowers", planar_pose(0, 0, 0.29), 0.11, colour=RED),
+    )
+
+
+def pendant(name: str, ceiling: float) -> Parts:
+    """Build a round lamp that hangs from a ceiling [m], its lowest point at 1.7 m."""
+    length = ceiling - 2.0
+    return (
+        Sphere(f"{name}.shade", planar_pose(0, 0, 1.87), 0.17, colour=(0.95, 0.9, 0.7)),
+        Cylinder(f"{name}.rod", planar_pose(0, 0, ceiling - length / 2), 0.01, length, colour=METAL),
+    )
+
+
+def picture(name: str, width: float, height: float, bottom: float = 1.3) -> Parts:
+    """Build a picture 3 cm thick to hang on a wall."""
+    return (_box(name, (width, 0.03, height), 0.0, 0.0, bottom, DARK_WOOD),)
+
+
+def bag(name: str) -> Parts:
+    """Build a travel bag that stands on the floor, with its handle."""
+    return (
+        _box(f"{name}.body", (0.36, 0.2, 0.42), 0.0, 0.0, 0.0, RED),
+        _box(f"{name}.handle", (0.16, 0.03, 0.08), 0.0, 0.0, 0.42, GREY),
+    )
+
+
+def bin_(name: str) -> Parts:
+    """Build a waste bin 0.4 m high."""
+    return (Cylinder(name, planar_pose(0, 0, 0.2), 0.13, 0.4, colour=GREY),)
+
+
 def room_shell(width: float, depth: float, height: float = 2.6, thickness: float = 0.12) -> Parts:
     """Build floor and four walls round the free volume |x| < width / 2, |y| < depth / 2, 0 < z < height."""
     t = thickness

@@ -126,7 +126,8 @@ def parcel(name: str) -> Box:
     return Box(name, np.eye(4), (0.25, 0.18, 0.1), colour=(0.75, 0.6, 0.4), mass=0.5, friction=0.8)
 
 
-def _fill_shelf(layout: Layout, name: str, piece: np.ndarray, heights: list[float], width: float) -> None:
+def fill_shelf(layout: Layout, name: str, piece: np.ndarray, heights: list[float], width: float) -> None:
+    """Put a row of books on each board whose top is at one of the heights [m] of a shelf of inner width [m]."""
     colours = (fn.RED, fn.GREEN, fn.BLUE, fn.GREY)
     for i, height in enumerate(heights):
         length = float(layout.rng.uniform(0.3, 0.8)) * width
@@ -150,7 +151,7 @@ def _apartment(layout: Layout) -> None:
     coffee = put(fn.table("coffee_table", 0.9, 0.5, 0.42, fn.DARK_WOOD), -2.2, 0.0, QUARTER)
     layout.drop(coffee, 0.42, parcel("coffee_parcel"), 0.15, 0.05)
     shelf = by_wall(fn.shelf("shelf", 1.4, 1.8, boards=5), -2.3, "north", 0.32)
-    _fill_shelf(layout, "shelf", shelf, [0.085, 0.51, 0.94, 1.37], 1.3)
+    fill_shelf(layout, "shelf", shelf, [0.085, 0.51, 0.94, 1.37], 1.3)
     cupboard = by_wall(fn.cupboard("sideboard", 1.2, 0.85), -0.9, "south", 0.45)
     layout.drop(cupboard, 0.85, bowl("sideboard_bowl"), 0.2, 0.0)
     put(fn.armchair("armchair"), -3.1, -2.1, 0.75 * np.pi)
@@ -174,7 +175,7 @@ def _office(layout: Layout) -> None:
     layout.drop(meeting, 0.74, bowl("meeting_bowl"), 0.4, 0.0)
     for i, x in enumerate((-0.9, 0.4)):
         case = by_wall(fn.shelf(f"bookcase{i}", 1.2, 2.0, boards=6), x, "north", 0.32)
-        _fill_shelf(layout, f"bookcase{i}", case, [0.085, 0.468, 0.851, 1.234], 1.1)
+        fill_shelf(layout, f"bookcase{i}", case, [0.085, 0.468, 0.851, 1.234], 1.1)
     put((Box("partition", planar_pose(0, 0, 0.75), (1.8, 0.06, 1.5), colour=fn.BLUE),), -1.15, -0.82, QUARTER)
     put((Cylinder("pillar", planar_pose(0, 0, 1.3), 0.2, 2.6, colour=fn.WHITE),), -1.15, 0.75)
     by_wall(fn.sofa("sofa", 1.8, fn.GREEN), 0.9, "south", 0.85)
@@ -202,7 +203,7 @@ def _flat(layout: Layout) -> None:
     counter = by_wall(fn.counter("counter", 2.2), -2.5, "south", 0.6)
     layout.drop(counter, 0.9, can("counter_can"), 0.5, 0.0)
     shelf = by_wall(fn.shelf("shelf", 1.2, 1.6), -1.9, "north", 0.32)
-    _fill_shelf(layout, "shelf", shelf, [0.085, 0.59, 1.1], 1.1)
+    fill_shelf(layout, "shelf", shelf, [0.085, 0.59, 1.1], 1.1)
     put(fn.plant("plant"), -3.55, 2.25)
     by_wall(fn.bed("bed"), 3.1, "north", 2.12)
     by_wall(fn.cupboard("wardrobe", 1.2, 2.0, 0.55), 1.4, "north", 0.58)

@@ -10,6 +10,7 @@ import numpy as np
 from robots.errors import SceneError
 from robots.simulation.free_space import FloorMap, floor_map
 from robots.simulation.furniture import room_shell
+from robots.simulation.homes import HOMES
 from robots.simulation.primitives import Primitive
 from robots.simulation.rooms import ROOMS, GraspTask, Layout
 
@@ -20,6 +21,7 @@ BASE_RADIUS = 0.5
 TRAVEL = 3.5
 """Least straight distance between start and goal [m]."""
 ATTEMPTS = 20
+FURNISHED = {**ROOMS, **HOMES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ class Scene:
 
 def available_scenes() -> tuple[str, ...]:
     """Names that `make_scene` knows."""
-    return tuple(ROOMS)
+    return tuple(FURNISHED)
 
 
 def make_scene(name: str, seed: int = 0) -> Scene:
@@ -79,9 +81,9 @@ def make_scene(name: str, seed: int = 0) -> Scene:
     Raises:
         SceneError: if there is no scene of that name.
     """
-    if name not in ROOMS:
+    if name not in FURNISHED:
         raise SceneError(f"no scene named {name!r}; choose one of {', '.join(available_scenes())}")
-    size, furnish = ROOMS[name]
+    size, furnish = FURNISHED[name]
     rng = np.random.default_rng([seed, *name.encode()])
     for _ in range(ATTEMPTS):
         layout = Layout(size, rng, static=list(room_shell(*size)))

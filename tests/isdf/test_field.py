@@ -7,6 +7,7 @@ import torch
 from isdf import ConfigError, CostField, GridField, IsdfError, NetworkConfig, NeuralField, bake, query
 from isdf.cost import collision_cost
 from isdf.field import check_points
+from isdf.meshing import zero_level_mesh
 from isdf.network import SDFNetwork
 from tests.gradients import assert_gradient_matches
 from tests.isdf.rooms import ball
@@ -152,3 +153,19 @@ def test_wrong_points_and_settings_are_refused() -> None:
         GridField(torch.zeros(1, 4, 4), torch.zeros(3), 0.1)
     with pytest.raises(IsdfError, match="floating point"):
         check_points(torch.zeros(4, 2))
+
+
+def test_a_balls_mesh_has_its_volume_and_faces_outward() -> None:
+    class Ball:
+        bounds = torch.tensor([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
+
+        def distance(self, points: torch.Tensor) -> torch.Tensor:
+            return points.norm(dim=-1) - 0.5
+
+    mesh = zero_level_mesh(Ball(), 0.03)
+    assert mesh.volume == pytest.approx(4 / 3 * torch.pi * 0.5**3, rel=0.01)
+    upward = mesh.vertices[:, 2] > 0.45
+    assert (
+        mesh.visual.vertex_colors[upward, 0].min()
+        > mesh.visual.vertex_colors[mesh.vertices[:, 2] < -0.45, 0].max()
+    )

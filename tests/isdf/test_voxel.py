@@ -33,16 +33,27 @@ from isdf.slices import draw_slice
 from isdf.voxel import (
     ExactConfig,
     ExactMapper,
+    FiestaConfig,
+    FiestaMapper,
     KinectFusionConfig,
     KinectFusionMapper,
     TsdfConfig,
     TsdfVolume,
+    VoxbloxConfig,
+    VoxbloxMapper,
 )
 from isdf.voxel.nearest_seed import observed_at
 from isdf.voxel.surface import surface_seeds
 from tests.isdf.rooms import furnished_orbit, furnished_room, look_at, render
 
-MAPPERS = {"exact": ExactMapper, "kinectfusion": KinectFusionMapper}
+MAPPERS = {
+    "exact": ExactMapper,
+    "voxblox": VoxbloxMapper,
+    "fiesta": FiestaMapper,
+    "kinectfusion": KinectFusionMapper,
+}
+# Share of the visible points that 12 views must map: the rivals drop rays, FIESTA at the first voxel met twice.
+COVERAGE = {"exact": 0.95, "voxblox": 0.95, "fiesta": 0.6, "kinectfusion": 0.95}
 every_method = pytest.mark.parametrize("method", MAPPERS)
 
 
@@ -77,6 +88,8 @@ def visible_points(count: int = 12000) -> torch.Tensor:
     ("method", "mean", "near", "cosine"),
     [
         ("exact", 0.025, 0.015, 0.08),
+        ("voxblox", 0.07, 0.03, 0.2),
+        ("fiesta", 0.06, 0.08, 0.2),
         ("kinectfusion", 0.06, 0.08, 0.15),
     ],
 )
@@ -94,7 +107,7 @@ def test_the_visible_room_is_measured(rooms, method, mean, near, cosine) -> None
     assert (1 - torch.cosine_similarity(gradient, normal, dim=-1)).mean() < cosine
     assert (distance[truth > 0.1] > 0).float().mean() > 0.999
     # The rest lies beyond the middle of the outermost rays' voxels.
-    assert field.confidence(points).mean() > 0.95
+    assert field.confidence(points).mean() > COVERAGE[method]
 
 
 @every_method
@@ -110,10 +123,13 @@ def test_the_unseen_has_no_confidence(rooms, method) -> None:
     unseen = torch.tensor(
         [[0.0, 0.0, 5.0], [9.0, 0.0, 1.0], [-2.0, 1.2, 0.9], [0.0, 2.6, 1.2], [math.nan, 0, 1]]
     )
-    seen = torch.tensor([[0.3, 0.3, 1.2], [1.5, -1.0, 1.0]])
+    seen = visible_points(480)
     field = rooms[method].field()
-    assert field.confidence(unseen).tolist() == [0.0] * 5 and field.confidence(seen).tolist() == [1.0] * 2
-    assert query(field, seen.numpy())["confidence"].tolist() == [1.0, 1.0]
+    assert field.confidence(unseen).tolist() == [0.0] * 5
+    assert field.confidence(seen).mean() > COVERAGE[method]
+    assert np.array_equal(query(field, seen.numpy())["confidence"], field.confidence(seen).numpy())
+    # Nobody is told that the unseen is infinitely far away, or nothing at all.
+    assert bool((field.distance(unseen[:4]).abs() < 8.0).all())
 
 
 def test_outside_the_volume_nothing_was_observed() -> None:
@@ -242,12 +258,16 @@ def test_a_lost_pose_is_refused_and_changes_nothing(method) -> None:
 @every_method
 def test_what_has_moved_away_is_forgotten(method) -> None:
     camera = PinholeCamera.from_fov(80, 60, math.radians(60))
-    near, far = (DepthFrame(torch.full((60, 80), depth), np.eye(4), camera, 0.0) for depth in (1.0, 2.0))
+    near = DepthFrame(torch.full((60, 80), 1.0), np.eye(4), camera, 0.0)
     mapper, here = mapped(method, frames=0), torch.tensor([[0.0, 0.0, 1.0]])
     mapper.integrate(near)
     assert mapper.field().distance(here).abs().item() < 0.1
+    generator = np.random.default_rng(0)
     for _ in range(40):
-        mapper.integrate(far)
+        # The camera moves a little: methods that drop rays leave the same gaps in every image from one place.
+        T = np.eye(4)
+        T[:2, 3] = generator.uniform(-0.1, 0.1, 2)
+        mapper.integrate(DepthFrame(torch.full((60, 80), 2.0), T, camera, 0.0))
     mapper.refresh()
     assert mapper.field().distance(here).item() == pytest.approx(1.0, abs=0.1)
 
@@ -321,7 +341,7 @@ def test_files_of_another_kind_are_named(rooms, tmp_path) -> None:
     [
         *(
             partial(kind, **{name: value})
-            for kind in (ExactConfig, KinectFusionConfig)
+            for kind in (ExactConfig, VoxbloxConfig, FiestaConfig, KinectFusionConfig)
             for name in ("voxel", "max_depth")
             for value in (0.0, -1.0, math.nan, math.inf)
         ),
@@ -370,7 +390,7 @@ def test_the_command_maps_and_answers(method, sequence_dir, tmp_path, monkeypatc
     expected = load_map(out / "map.safetensors").field().distance(torch.from_numpy(points))
     np.testing.assert_allclose(answers["distance"], expected.numpy(), atol=1e-5)
     assert answers["gradient"].shape == (97, 3)
-    assert answers["confidence"][:-1].mean() > 0.9 and answers["confidence"][-1] == 0
+    assert answers["confidence"][:-1].mean() > COVERAGE[method] - 0.05 and answers["confidence"][-1] == 0
 
 
 def test_options_of_another_method_are_refused(sequence_dir, tmp_path, monkeypatch, capsys) -> None:

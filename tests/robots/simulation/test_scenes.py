@@ -10,7 +10,7 @@ from robots.simulation import Scene, SceneField, Sphere, available_scenes, load_
 from robots.simulation.free_space import floor_map
 
 SCENES = [(name, seed) for name in ("apartment", "office") for seed in range(10)]
-SCENES += [("flat", seed) for seed in range(3)]
+SCENES += [(name, seed) for name in ("flat", "home_1", "home_2") for seed in range(3)]
 
 
 def _column_clearance(field: SceneField, places: np.ndarray) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_objects_rest_on_something_and_touch_nothing_else(name):
 @pytest.mark.parametrize("name", available_scenes())
 def test_furniture_stays_in_the_room_and_does_not_run_into_other_furniture(name):
     scene = make_scene(name, 2)
-    shell = {s.name for s in scene.static if s.name.startswith(("floor", "wall"))}
+    shell = {s.name for s in scene.static if s.name.startswith(("floor", "wall", "ceiling"))}
     low, high = -np.array(scene.size) / 2, np.array(scene.size) / 2
     for solid in scene.static:
         if solid.name in shell:
