@@ -21,7 +21,7 @@ from tests.isdf.rooms import furnished_orbit
 class Rates:
     """A mapper gets frames of a synthetic room at a camera's rate; planners ask at theirs."""
 
-    method: Literal["isdf", "exact"] = "isdf"
+    method: Literal["default", "isdf", "exact"] = "default"
     planners: int = 4
     """Threads that ask."""
     rate: float = 1000.0
@@ -50,8 +50,8 @@ def main(args: Rates) -> None:
     """Run and print."""
     torch.set_num_threads(1)
     frames = furnished_orbit(12)
-    config = isdf.MapperConfig() if args.method == "isdf" else ExactConfig()
-    with isdf.BackgroundMapper(new_mapper(config)) as background:
+    configs = {"default": isdf.MapperConfig(), "isdf": isdf.IsdfConfig(), "exact": ExactConfig()}
+    with isdf.BackgroundMapper(new_mapper(configs[args.method])) as background:
         background.integrate(frames[0])
         background.flush()
         begun, end = background.rates(), time.monotonic() + args.seconds

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-from isdf import MapperConfig
+from isdf import IsdfConfig
 from isdf.bounds import BoundMethod
 from isdf.datasets import DepthSequence
 from isdf.methods import Config, OnlineMapper
@@ -29,7 +29,7 @@ class Clock:
     def run(self, sequence: DepthSequence, config: Config, watch: Watch) -> tuple[OnlineMapper, RunReport]:
         """Map the sequence by this clock."""
         if self.unit == "steps":
-            assert isinstance(config, MapperConfig)
+            assert isinstance(config, IsdfConfig)
             return run_at_steps(sequence, config, self.amount, watch)
         return run_at_rate(sequence, config, self.amount, watch)
 
@@ -67,7 +67,7 @@ class Job:
 
 
 METHODS: dict[str, Config] = {
-    "isdf": MapperConfig(),
+    "isdf": IsdfConfig(),
     "voxblox": VoxbloxConfig(),
     "fiesta": FiestaConfig(),
     "kinectfusion": KinectFusionConfig(),
@@ -93,17 +93,17 @@ def half_budget(sequences: Sequence[str], seeds: Sequence[int]) -> list[Job]:
 
 def bounds_ablation(sequences: Sequence[str], seeds: Sequence[int]) -> list[Job]:
     """The three supervision bounds with the small network, 30 steps for each second of sequence."""
-    return _bounds("bounds", MapperConfig(), get_args(BoundMethod), sequences, seeds)
+    return _bounds("bounds", IsdfConfig(), get_args(BoundMethod), sequences, seeds)
 
 
 def fidelity(sequences: Sequence[str], seeds: Sequence[int]) -> list[Job]:
     """The released settings in full, batch bound, 30 steps a second: about two CPU seconds a step."""
-    return _bounds("fidelity", MapperConfig.released(), ("batch",), sequences, seeds)
+    return _bounds("fidelity", IsdfConfig.released(), ("batch",), sequences, seeds)
 
 
 def fidelity_bounds(sequences: Sequence[str], seeds: Sequence[int]) -> list[Job]:
     """The released settings in full with the other two bounds."""
-    return _bounds("fidelity", MapperConfig.released(), ("normal", "ray"), sequences, seeds)
+    return _bounds("fidelity", IsdfConfig.released(), ("normal", "ray"), sequences, seeds)
 
 
 def real_sequences(sequences: Sequence[str], seeds: Sequence[int]) -> list[Job]:
@@ -128,13 +128,13 @@ def _methods(
         Job(experiment, sequence, method, _seeded(config, seed), clock, seed)
         for sequence in sequences
         for method, config in methods.items()
-        for seed in (seeds if isinstance(config, MapperConfig) else (0,))
+        for seed in (seeds if isinstance(config, IsdfConfig) else (0,))
     ]
 
 
 def _bounds(
     experiment: str,
-    config: MapperConfig,
+    config: IsdfConfig,
     bounds: Sequence[BoundMethod],
     sequences: Sequence[str],
     seeds: Sequence[int],
@@ -148,4 +148,4 @@ def _bounds(
 
 
 def _seeded(config: Config, seed: int) -> Config:
-    return replace(config, seed=seed) if isinstance(config, MapperConfig) else config
+    return replace(config, seed=seed) if isinstance(config, IsdfConfig) else config

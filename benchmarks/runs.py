@@ -18,7 +18,7 @@ import torch
 
 from benchmarks.experiments import REAL, REGION_OF, Job
 from benchmarks.stages import stage_times
-from isdf import Mapper, MapperConfig, NotReadyError
+from isdf import IsdfConfig, IsdfMapper, NotReadyError
 from isdf.datasets import DepthSequence, open_sequence
 from isdf.evaluation import (
     Truth,
@@ -153,7 +153,7 @@ class Snapshots:
 
 
 def _map(job: Job, sequence: DepthSequence, watch: Watch) -> tuple[OnlineMapper, RunReport]:
-    if not isinstance(job.config, MapperConfig):
+    if not isinstance(job.config, IsdfConfig):
         # What is compiled is compiled before the clock runs.
         trial = new_mapper(job.config)
         for index in range(min(2, len(sequence))):
@@ -167,7 +167,7 @@ def _judge(study: Study, job: Job, index: int, moment: float, steps: int, shown:
     if shown is None:
         return empty
     truth = read_truth(study.points_file(job.sequence, f"{index:02d}"))
-    unmapped = None if isinstance(job.config, MapperConfig) else shown.confidence(truth.points) == 0
+    unmapped = None if isinstance(job.config, IsdfConfig) else shown.confidence(truth.points) == 0
     region = _region(study, job, index, truth, unmapped)
     own = evaluate(shown, truth, "own").gradient_distance
     found: dict[str, Any] = {
@@ -210,7 +210,7 @@ def _record(study: Study, job: Job, mapper: OnlineMapper, report: RunReport) -> 
         "memory": _memory(mapper) | {"file": file.stat().st_size},
         "query_us": query_time(mapper.field(), points),
         "keyframes": _keyframes(mapper),
-        "stages_ms": stage_times(mapper, TIMED_STEPS) if isinstance(mapper, Mapper) else None,
+        "stages_ms": stage_times(mapper, TIMED_STEPS) if isinstance(mapper, IsdfMapper) else None,
         "machine": {
             "processor": processor(),
             "torch": torch.__version__,

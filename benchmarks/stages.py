@@ -6,7 +6,7 @@ import cProfile
 import pstats
 import time
 
-from isdf import Mapper
+from isdf import IsdfMapper
 
 # Functions by whose running time, all they call included, a stage is measured: (file's end, name).
 STAGES = {
@@ -17,7 +17,7 @@ STAGES = {
 }
 
 
-def stage_times(mapper: Mapper, steps: int) -> dict[str, float]:
+def stage_times(mapper: IsdfMapper, steps: int) -> dict[str, float]:
     """CPU time of each stage of a training step [ms], with what is left as "other" and their sum as "step".
 
     Args:
@@ -31,7 +31,7 @@ def stage_times(mapper: Mapper, steps: int) -> dict[str, float]:
     profile.runcall(lambda: [mapper.step() for _ in range(steps)])
     stats = pstats.Stats(profile)
     times = {stage: sum(_cumulative(stats, *place) for place in places) for stage, places in STAGES.items()}
-    step = _cumulative(stats, "isdf/mapper.py", "step")
+    step = _cumulative(stats, "isdf/isdf_mapper.py", "step")
     times |= {"other": step - sum(times.values()), "step": step}
     return {stage: 1e3 * seconds / steps for stage, seconds in times.items()}
 

@@ -17,7 +17,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from isdf import MapperConfig, NetworkConfig
+from isdf import IsdfConfig, NetworkConfig
 from isdf.network import SOFTPLUS_BETA, SDFNetwork
 
 
@@ -40,10 +40,10 @@ def main(options: StepCost) -> None:
         f"{'network':>10} {'parameters':>10} {'ours':>9} {'double':>9} {'ratio':>6} {'floor':>9} {'ratio':>6}"
     )
     sizes = {
-        "cpu preset": MapperConfig().network,
+        "cpu preset": IsdfConfig().network,
         "4 x 128": NetworkConfig(width=128),
         "4 x 256": NetworkConfig(),
-        "6 x 256": MapperConfig.released().network,
+        "6 x 256": IsdfConfig.released().network,
     }
     for name, config in sizes.items():
         network = SDFNetwork(config, torch.zeros(3), torch.Generator().manual_seed(0))

@@ -61,7 +61,7 @@ class Episode:
         self.body = robots.SweptBase(self.model, torch.as_tensor(q, dtype=torch.float32))
         # The loop decides when to train, so taking in a frame does not.
         untimed = {"first_frame_steps": 0, "steps_per_frame": 0, "keyframe_steps": 0}
-        self.mapper = isdf.Mapper(replace(isdf.MapperConfig(seed=options.seed), **untimed))
+        self.mapper = isdf.IsdfMapper(replace(isdf.IsdfConfig(seed=options.seed), **untimed))
 
     def field_for_driving(self) -> DistanceField:
         """The map up to the robot's height, baked for fast queries."""

@@ -15,9 +15,10 @@ from .errors import (
 )
 from .field import GridField, NeuralField, bake, query
 from .frames import DepthFrame
+from .isdf_mapper import IsdfConfig, IsdfMapper
 from .keyframes import KeyframeConfig
 from .losses import LossConfig
-from .mapper import Mapper, MapperConfig
+from .mapping import LatticeField, Mapper, MapperConfig
 from .methods import load_map
 from .network import NetworkConfig
 from .sampling import SamplingConfig
@@ -33,8 +34,11 @@ __all__ = [
     "DepthFrame",
     "FrameError",
     "GridField",
+    "IsdfConfig",
     "IsdfError",
+    "IsdfMapper",
     "KeyframeConfig",
+    "LatticeField",
     "LossConfig",
     "Mapper",
     "MapperConfig",

@@ -285,16 +285,16 @@ class BackgroundMapper:
         return not ending
 
     def _integrate(self, frame: DepthFrame) -> None:
-        refused = None
+        before = self._mapper.frames_seen
         try:
             self._mapper.integrate(frame)
         except FrameError as error:
             logger.warning("frame at %.3f s passed over: %s", frame.time, error)
-            refused = error
+        used = self._mapper.frames_seen > before
         with self._changed:
-            self._used += refused is None
-            self._refused += refused is not None
-            self._frame_time = self._frame_time if refused else frame.time
+            self._used += used
+            self._refused += not used
+            self._frame_time = frame.time if used else self._frame_time
 
     def _save(self, path: Path, done: threading.Event, errors: list[BaseException]) -> None:
         try:

@@ -19,13 +19,13 @@ from .network import NetworkConfig, SDFNetwork
 from .sampling import SamplingConfig
 
 if TYPE_CHECKING:
-    from .mapper import Mapper, MapperConfig
+    from .isdf_mapper import IsdfConfig, IsdfMapper
 
 FORMAT = "isdf-map"
 VERSION = 1
 
 
-def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
+def save(mapper: IsdfMapper, path: Path, note: Mapping[str, Any]) -> None:
     """Write the whole state of a mapper; an existing file is replaced only by a complete new one.
 
     Args:
@@ -41,7 +41,7 @@ def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
     write(path, tensors, {**note, **header})
 
 
-def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
+def load(path: Path, device: str | torch.device = "cpu") -> IsdfMapper:
     """Read a map written by `save`.
 
     Raises:
@@ -52,7 +52,7 @@ def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
         return _restore(tensors, header, device)
 
 
-def _state(mapper: Mapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def _state(mapper: IsdfMapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     tensors: dict[str, torch.Tensor] = {
         "bounds": mapper.bounds,
         "generator": mapper.generator.get_state(),
@@ -85,13 +85,15 @@ def _state(mapper: Mapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     return tensors, header
 
 
-def _restore(tensors: dict[str, torch.Tensor], header: dict[str, Any], device: str | torch.device) -> Mapper:
-    from .mapper import Mapper, new_optimiser
+def _restore(
+    tensors: dict[str, torch.Tensor], header: dict[str, Any], device: str | torch.device
+) -> IsdfMapper:
+    from .isdf_mapper import IsdfMapper, new_optimiser
 
     config = _config(header["config"])
     _check_size(config.network, tensors)
     require_finite(tensors)
-    mapper = Mapper(config, device)
+    mapper = IsdfMapper(config, device)
     mapper.frames_seen, mapper.steps = int(header["frames_seen"]), int(header["steps"])
     mapper.generator.set_state(tensors["generator"])
     mapper._bounds = tensors["bounds"].reshape(2, 3)
@@ -145,10 +147,10 @@ def _network(tensors: dict[str, torch.Tensor], prefix: str, config: NetworkConfi
     return network
 
 
-def _config(values: dict[str, Any]) -> MapperConfig:
-    from .mapper import MapperConfig
+def _config(values: dict[str, Any]) -> IsdfConfig:
+    from .isdf_mapper import IsdfConfig
 
-    return MapperConfig(
+    return IsdfConfig(
         **values
         | {
             "network": NetworkConfig(**values["network"]),

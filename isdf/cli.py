@@ -21,7 +21,8 @@ from .checkpointing import Checkpointer, Stopped, take_up
 from .commands import MAP_FILE, Export, Info, Outcome, Query
 from .datasets import DepthSequence, open_sequence
 from .errors import CheckpointError, ConfigError, IsdfError
-from .mapper import MapperConfig
+from .isdf_mapper import IsdfConfig
+from .mapping import MapperConfig
 from .methods import Config, OnlineMapper, VoxelConfig
 from .results import write_results
 from .runner import Begun, RunReport, Watch, run_at_rate, run_at_steps, run_every_frame
@@ -62,9 +63,10 @@ class Map:
     """Optimisation steps for each second of sequence; the paper's machine made about 30."""
     cpu_per_second: float | None = None
     """CPU seconds allowed for each second of sequence; 1.0 when neither clock is given."""
-    method: Literal["isdf", "exact", "voxblox", "fiesta", "kinectfusion"] = "isdf"
-    """isdf: the neural field. exact: distances to sub-voxel surface points of a TSDF. voxblox, fiesta, kinectfusion:
-    the rivals that the paper names. The voxel methods need no steps and no more time than fusion takes."""
+    method: Literal["default", "isdf", "exact", "voxblox", "fiesta", "kinectfusion"] = "default"
+    """default: exact where the camera looked, guessed by a network elsewhere. isdf: the paper's neural field. exact:
+    distances to sub-voxel surface points of a TSDF. voxblox, fiesta, kinectfusion: the rivals that the paper names.
+    All but isdf need no steps and no more time than fusion takes."""
     voxel: float | None = None
     """Edge of a voxel of the voxel methods [m]; by default 0.04 (exact), 0.055 (voxblox, fiesta) and 0.07
     (kinectfusion)."""
@@ -147,7 +149,7 @@ class Map:
         if self.steps_per_frame is not None:
             return run_every_frame(sequence, config, self.steps_per_frame, watch, begun)
         if self.steps_per_second is not None:
-            if not isinstance(config, MapperConfig):
+            if not isinstance(config, IsdfConfig):
                 raise ConfigError(
                     f"--steps-per-second belongs to --method isdf; {self.method} makes no steps"
                 )
@@ -161,13 +163,15 @@ class Map:
                 raise ConfigError(
                     f"--preset and --bound belong to --method isdf; leave them out for {self.method}"
                 )
-            config = VOXEL_METHODS[self.method]()
+            config: VoxelConfig | MapperConfig = VOXEL_METHODS.get(self.method, MapperConfig)()
+            if self.voxel is not None and self.method == "default":
+                raise ConfigError(f"--voxel belongs to the voxel methods: {', '.join(VOXEL_METHODS)}")
             return config if self.voxel is None else dataclasses.replace(config, voxel=self.voxel)
         if self.voxel is not None:
             raise ConfigError(
                 f"--voxel belongs to the voxel methods: add --method {' or '.join(VOXEL_METHODS)}"
             )
-        presets = {"cpu": MapperConfig(), "paper": MapperConfig.paper(), "released": MapperConfig.released()}
+        presets = {"cpu": IsdfConfig(), "paper": IsdfConfig.paper(), "released": IsdfConfig.released()}
         return dataclasses.replace(presets[self.preset], seed=self.seed, bound=self.bound)
 
 

@@ -24,7 +24,7 @@ def zero_level_mesh(
     padding: float = 0.1,
     up: np.ndarray | None = None,
 ) -> trimesh.Trimesh:
-    """Marching cubes over the region a field was learned in; only where the field's `confidence`, if any, is not 0.
+    """Marching cubes over the region a field was learned in; only where its `confidence`, if any, is 0.5 or more.
 
     Args:
         field: a distance field; `bounds` is taken from it unless given.
@@ -54,7 +54,7 @@ def zero_level_mesh(
 
 def _observed_cells(field: Any, grid: GridField) -> np.ndarray:
     """Which cells have eight corners of some confidence, by their highest corner; of the shape of the grid."""
-    known = (field.confidence(grid_points(grid.bounds, grid.spacing)) > 0).cpu().numpy()
+    known = (field.confidence(grid_points(grid.bounds, grid.spacing)) >= 0.5).cpu().numpy()
     known = known[tuple(slice(n) for n in grid.values.shape)]
     for axis in range(3):
         known &= np.roll(known, 1, axis)

@@ -8,7 +8,9 @@ import torch
 
 from . import checkpoint, mapfile
 from .errors import CheckpointError, ConfigError
-from .mapper import Mapper, MapperConfig
+from .isdf_mapper import IsdfConfig, IsdfMapper
+from .mapping import Mapper, MapperConfig
+from .mapping.state import FORMAT as LATTICE_FORMAT
 from .voxel import (
     ExactConfig,
     ExactMapper,
@@ -22,18 +24,20 @@ from .voxel import (
 )
 
 VoxelConfig = ExactConfig | VoxbloxConfig | FiestaConfig | KinectFusionConfig
-Config = MapperConfig | VoxelConfig
-OnlineMapper = Mapper | ExactMapper | VoxbloxMapper | FiestaMapper | KinectFusionMapper
+Config = MapperConfig | IsdfConfig | VoxelConfig
+OnlineMapper = Mapper | IsdfMapper | ExactMapper | VoxbloxMapper | FiestaMapper | KinectFusionMapper
 
 _MAPPERS: dict[type, type[OnlineMapper]] = {
     MapperConfig: Mapper,
+    IsdfConfig: IsdfMapper,
     ExactConfig: ExactMapper,
     VoxbloxConfig: VoxbloxMapper,
     FiestaConfig: FiestaMapper,
     KinectFusionConfig: KinectFusionMapper,
 }
 _FORMATS: dict[str, type[OnlineMapper]] = {
-    checkpoint.FORMAT: Mapper,
+    LATTICE_FORMAT: Mapper,
+    checkpoint.FORMAT: IsdfMapper,
     ExactMapper.FORMAT: ExactMapper,
     VoxbloxMapper.FORMAT: VoxbloxMapper,
     FiestaMapper.FORMAT: FiestaMapper,

@@ -12,9 +12,9 @@ import numpy as np
 from .atomic import replacing
 from .commands import MAP_FILE, Outcome
 from .datasets import DepthSequence
+from .isdf_mapper import IsdfMapper
 from .methods import OnlineMapper
 from .runner import RunReport
-from .voxel import VoxelMapper
 
 
 def write_results(
@@ -39,7 +39,7 @@ def write_results(
     with replacing(out / "mesh.ply") as temporary:
         mesh.export(temporary, file_type="ply")
     heights = list(settings.slice_heights) or slice_heights(field, up)
-    frames = [] if isinstance(mapper, VoxelMapper) else mapper.keyframes.frames
+    frames = mapper.keyframes.frames if isinstance(mapper, IsdfMapper) else []
     keyframes = np.array([f.T_world_camera[:3, 3].numpy() for f in frames]).reshape(-1, 3)
     with replacing(out / "slices.png") as temporary:
         save_slices(temporary, field, heights, up, poses, keyframes)

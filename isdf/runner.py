@@ -9,9 +9,8 @@ from dataclasses import dataclass, field, replace
 
 from .datasets import DepthSequence
 from .errors import ConfigError, DatasetError, FrameError
-from .mapper import MapperConfig
+from .isdf_mapper import IsdfConfig, IsdfMapper
 from .methods import Config, OnlineMapper, new_mapper
-from .voxel import VoxelMapper
 
 logger = logging.getLogger(__name__)
 
@@ -79,11 +78,11 @@ def run_every_frame(
 ) -> tuple[OnlineMapper, RunReport]:
     """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take.
 
-    Voxel maps have no steps and only integrate.
+    Only the paper's method makes steps; the others just integrate.
     """
     if steps_per_frame < 1:
         raise ConfigError(f"steps_per_frame must be at least 1, got {steps_per_frame}")
-    if isinstance(config, MapperConfig):
+    if isinstance(config, IsdfConfig):
         config = replace(
             config, first_frame_steps=steps_per_frame, steps_per_frame=steps_per_frame, keyframe_steps=0
         )
@@ -97,7 +96,7 @@ def run_every_frame(
 
 def run_at_steps(
     sequence: DepthSequence,
-    config: MapperConfig,
+    config: IsdfConfig,
     steps_per_second: float,
     watch: Watch,
     begun: Begun | None = None,
@@ -130,13 +129,13 @@ def run_at_rate(
     """Live: at most `cpu_per_second` CPU seconds for each second of sequence.
 
     The sequence's clock advances with the CPU time used. When the mapper is ready for another frame it gets the
-    newest that has arrived; those it missed are dropped. While none has arrived it trains on; a voxel map, which has
-    nothing to train, waits for it: the clock is moved on to then.
+    newest that has arrived; those it missed are dropped. While none has arrived the paper's method trains on; the
+    others, which have nothing to train, wait for it: the clock is moved on to then.
     """
     if not cpu_per_second > 0:
         raise ConfigError(f"cpu_per_second must be positive, got {cpu_per_second}")
     live, frame_steps = config, 0
-    if isinstance(config, MapperConfig):
+    if isinstance(config, IsdfConfig):
         live = replace(config, first_frame_steps=0, steps_per_frame=0, keyframe_steps=0)
         frame_steps = config.steps_per_frame
     mapper, report = _take_up(begun, live)
@@ -150,7 +149,7 @@ def run_at_rate(
         last = newest
         spent.watch(mapper, newest + 1)
         # Nothing usable yet, or nothing to train: wait for the next frame without burning time.
-        if mapper.frames_seen == 0 or isinstance(mapper, VoxelMapper):
+        if mapper.frames_seen == 0 or not isinstance(mapper, IsdfMapper):
             newest_time = (newest + 1) / sequence.fps * cpu_per_second
             report.waited_seconds += max(0.0, newest_time - (spent.cpu + report.waited_seconds))
             continue
@@ -180,11 +179,15 @@ def _take_up(begun: Begun | None, config: Config) -> tuple[OnlineMapper, RunRepo
 
 def _integrate(mapper: OnlineMapper, sequence: DepthSequence, index: int, report: RunReport) -> bool:
     """Give one frame to the mapper; an unusable one is recorded and passed over, as a live camera's would be."""
+    before = mapper.frames_seen
     try:
         mapper.integrate(sequence[index])
     except (FrameError, DatasetError) as error:
         logger.warning("frame %d passed over: %s", index, error)
         report.frames_refused[index] = str(error)
+        return False
+    if mapper.frames_seen == before:  # the mapper has said why in the log
+        report.frames_refused[index] = "it contradicts the map or repeats the last image"
         return False
     report.frames_used += 1
     return True
@@ -196,10 +199,10 @@ def _finish(report: RunReport, mapper: OnlineMapper, sequence: DepthSequence, sp
             f"{sequence.folder}: none of the {len(sequence)} frames could be used; the first was refused because "
             f"{next(iter(report.frames_refused.values()), 'it never arrived')}"
         )
-    if isinstance(mapper, VoxelMapper):
-        mapper.refresh()
-    else:
+    if isinstance(mapper, IsdfMapper):
         report.keyframes = len(mapper.keyframes)
+    else:
+        mapper.refresh()
     report.frames, report.steps = len(sequence), mapper.steps
     report.sequence_seconds = len(sequence) / sequence.fps
     report.cpu_seconds, report.wall_seconds = spent.cpu, spent.wall

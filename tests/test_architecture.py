@@ -114,7 +114,7 @@ WINDOWS = {"tkinter", "pyglet", "viser", "cv2", "open3d", "matplotlib.pyplot", "
 @pytest.mark.parametrize(
     ("package", "unwanted"),
     [
-        ("isdf", {"pybullet", "casadi", "numba", "pytorch_kinematics", "planning", "robots"} | WINDOWS),
+        ("isdf", {"pybullet", "casadi", "pytorch_kinematics", "planning", "robots"} | WINDOWS),
         ("planning", {"pybullet", "casadi", "numba", "pytorch_kinematics", "isdf", "robots"} | WINDOWS),
         # pytorch_kinematics loads pyplot, which opens no window by that.
         (

@@ -15,14 +15,14 @@ from benchmarks import experiments, mapping, mapping_report, runs, tables
 from benchmarks.experiments import Clock, Job
 from benchmarks.runs import Study, prepare, run
 from benchmarks.stages import stage_times
-from isdf import Mapper, MapperConfig, NetworkConfig, PinholeCamera, SamplingConfig
+from isdf import IsdfConfig, IsdfMapper, NetworkConfig, PinholeCamera, SamplingConfig
 from isdf.datasets import SequenceWriter, open_sequence
 from isdf.methods import load_map
 from isdf.voxel import ExactConfig
 from robots.simulation import Box, SceneField, Sphere, save_truth
 from tests.isdf.rooms import look_at, render
 
-SMALL = MapperConfig(
+SMALL = IsdfConfig(
     network=NetworkConfig(width=16),
     sampling=SamplingConfig(rays_per_frame=10, stratified=3, near_surface=2),
     first_frame_steps=4,
@@ -205,7 +205,7 @@ def test_held_out_frames_judge_a_map_of_the_others(study) -> None:
 
 
 def test_stages_sum_to_the_step_and_none_is_forgotten(recorded) -> None:
-    mapper = Mapper(SMALL)
+    mapper = IsdfMapper(SMALL)
     mapper.integrate(open_sequence(recorded / "room")[0])
     before = mapper.steps
     times = stage_times(mapper, 5)

@@ -10,7 +10,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isdf import KeyframeConfig, LossConfig, MapperConfig, NetworkConfig, SamplingConfig
+from isdf import IsdfConfig, KeyframeConfig, LossConfig, MapperConfig, NetworkConfig, SamplingConfig
 from isdf.export import ExportConfig
 from isdf.methods import new_mapper
 from isdf.voxel import ExactConfig, KinectFusionConfig
@@ -18,8 +18,8 @@ from tests.fuzz.accepts import assert_answers, only_own_errors
 from tests.fuzz.readers import COARSE, TINY
 from tests.isdf.rooms import furnished_orbit
 
-PARTS = (NetworkConfig, SamplingConfig, LossConfig, KeyframeConfig, MapperConfig)
-WHOLE = (*PARTS, ExactConfig, KinectFusionConfig, ExportConfig)
+PARTS = (NetworkConfig, SamplingConfig, LossConfig, KeyframeConfig, IsdfConfig)
+WHOLE = (*PARTS, MapperConfig, ExactConfig, KinectFusionConfig, ExportConfig)
 FLOATS = st.one_of(
     st.floats(), st.sampled_from([0.0, -1.0, 1e-30, 1e30, math.nan, math.inf]), st.floats(0.01, 2)
 )
@@ -57,7 +57,7 @@ def any_numbers(data: st.DataObject, kind: type) -> None:
                 assert math.isfinite(number) or field.name in MAY_BE_INFINITE, f"{field.name} is {number}"
 
 
-@given(st.data(), st.sampled_from([*PARTS, ExactConfig, KinectFusionConfig]))
+@given(st.data(), st.sampled_from([*PARTS, MapperConfig, ExactConfig, KinectFusionConfig]))
 def any_config_maps(data: st.DataObject, kind: type) -> None:
     """What was accepted maps: two frames, and finite answers or an error of the package's own."""
     hints = typing.get_type_hints(kind)
@@ -70,6 +70,8 @@ def any_config_maps(data: st.DataObject, kind: type) -> None:
         elif kind is KinectFusionConfig:
             config = dataclasses.replace(KinectFusionConfig(voxel=0.25, max_voxels=200_000), **changed)
         elif kind is MapperConfig:
+            config = MapperConfig(**changed)
+        elif kind is IsdfConfig:
             config = dataclasses.replace(TINY, **changed)
         else:
             (part,) = [f.name for f in dataclasses.fields(TINY) if isinstance(getattr(TINY, f.name), kind)]

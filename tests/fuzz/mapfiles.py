@@ -11,14 +11,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isdf import CheckpointError, load_map, mapfile
+from isdf import CheckpointError, MapperConfig, load_map, mapfile
 from isdf.methods import new_mapper
 from isdf.voxel import KinectFusionConfig
 from tests.fuzz.accepts import OUTCOMES, only_own_errors
 from tests.fuzz.readers import COARSE, TINY
 from tests.isdf.rooms import furnished_orbit
 
-CONFIGS = {"isdf": TINY, "exact": COARSE, "kinectfusion": KinectFusionConfig(voxel=0.25, max_voxels=200_000)}
+CONFIGS = {
+    "default": MapperConfig(),
+    "isdf": TINY,
+    "exact": COARSE,
+    "kinectfusion": KinectFusionConfig(voxel=0.25, max_voxels=200_000),
+}
 JSON = st.recursive(
     st.one_of(
         st.none(),

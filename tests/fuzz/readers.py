@@ -9,14 +9,14 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isdf import FrameError, KeyframeConfig, Mapper, MapperConfig, NetworkConfig, SamplingConfig
+from isdf import FrameError, IsdfConfig, IsdfMapper, KeyframeConfig, Mapper, NetworkConfig, SamplingConfig
 from isdf.datasets import SequenceWriter, open_sequence
 from isdf.voxel import ExactConfig, ExactMapper
 from tests.fuzz.accepts import assert_answers, only_own_errors
 from tests.isdf.rooms import furnished_orbit
 from tests.isdf.test_readers import write_polycam, write_replica, write_scannet, write_seven_scenes, write_tum
 
-TINY = MapperConfig(
+TINY = IsdfConfig(
     network=NetworkConfig(width=8, hidden_layers=2, skip_layer=2, frequency_octaves=1),
     sampling=SamplingConfig(rays_per_frame=5, stratified=2, near_surface=1),
     keyframes=KeyframeConfig(test_rays=10, test_samples=5),
@@ -98,7 +98,7 @@ def broken_recordings(layout: str, broken: list[tuple[str, float, float, bytes]]
         with only_own_errors(f"recording {layout}"):
             sequence = open_sequence(folder)
             assert len(sequence) >= 1 and 0 < sequence.fps < float("inf")
-            mappers = [Mapper(TINY), ExactMapper(COARSE)]
+            mappers = [Mapper(), IsdfMapper(TINY), ExactMapper(COARSE)]
             for index in range(min(len(sequence), 3)):
                 with only_own_errors(f"frame {layout}"):
                     frame = sequence[index]

@@ -14,6 +14,8 @@ from isdf import (
     ConfigError,
     DepthFrame,
     FrameError,
+    IsdfConfig,
+    IsdfMapper,
     Mapper,
     MapperConfig,
     NotReadyError,
@@ -43,13 +45,15 @@ def witnessed(base: type):
 def mapper_of(method: str):
     if method == "exact":
         mapper = witnessed(ExactMapper)(ExactConfig(rebuild_period=0.05))
+    elif method == "default":
+        mapper = witnessed(Mapper)(MapperConfig())
     else:
-        mapper = witnessed(Mapper)(MapperConfig(first_frame_steps=1, steps_per_frame=1, keyframe_steps=0))
+        mapper = witnessed(IsdfMapper)(IsdfConfig(first_frame_steps=1, steps_per_frame=1, keyframe_steps=0))
     mapper.notes, mapper.kept = {}, []
     return mapper
 
 
-@pytest.mark.parametrize("method", ["isdf", "exact"])
+@pytest.mark.parametrize("method", ["default", "isdf", "exact"])
 def test_snapshots_are_whole_under_load(method) -> None:
     """Four planners at 1 kHz (as far as the machine goes) against a mapper that never rests."""
     mapper, stop = mapper_of(method), threading.Event()
@@ -197,7 +201,7 @@ def test_bad_frames_are_refused_to_the_caller_or_counted(tmp_path) -> None:
 
 
 def test_training_goes_on_while_no_frame_waits() -> None:
-    with BackgroundMapper(Mapper(), publish_every=0.01) as background:
+    with BackgroundMapper(IsdfMapper(), publish_every=0.01) as background:
         background.integrate(furnished_orbit(12)[0])
         background.flush(60.0)
         first = background.snapshot()

@@ -12,7 +12,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from isdf import ConfigError, DatasetError, Mapper, MapperConfig
+from isdf import ConfigError, DatasetError, IsdfConfig, IsdfMapper
 from isdf.cli import main
 from isdf.datasets import RecordedSequence, SequenceWriter
 from isdf.runner import run_at_rate, run_at_steps, run_every_frame
@@ -103,7 +103,7 @@ def test_unusable_frames_are_passed_over_and_reported(sequence_dir) -> None:
     lines = (sequence_dir / "poses.txt").read_text().splitlines()
     lines[6] = " ".join(["5", *["nan"] * 16])
     (sequence_dir / "poses.txt").write_text("\n".join(lines))
-    mapper, report = run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 1, lambda *_: None)
+    mapper, report = run_every_frame(RecordedSequence(sequence_dir), IsdfConfig(), 1, lambda *_: None)
     assert sorted(report.frames_refused) == [0, 3, 5] and report.frames_used == 9 and mapper.frames_seen == 9
     assert "no valid pixel" in report.frames_refused[0] and "NaN" in report.frames_refused[5]
 
@@ -113,18 +113,18 @@ def test_a_sequence_without_any_usable_frame_is_an_error(sequence_dir) -> None:
         Image.fromarray(np.zeros((60, 80), np.uint16)).save(sequence_dir / "depth" / f"{index:06d}.png")
     for run, clock in ((run_every_frame, 1), (run_at_rate, 0.05), (run_at_steps, 30.0)):
         with pytest.raises(DatasetError, match="none of the 12 frames"):
-            run(RecordedSequence(sequence_dir), MapperConfig(), clock, lambda *_: None)
+            run(RecordedSequence(sequence_dir), IsdfConfig(), clock, lambda *_: None)
 
 
 def test_every_frame_gets_its_steps(sequence_dir) -> None:
-    mapper, report = run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 2, lambda *_: None)
+    mapper, report = run_every_frame(RecordedSequence(sequence_dir), IsdfConfig(), 2, lambda *_: None)
     assert mapper.steps == report.steps == 24 and report.frames_used == 12 and report.frames_dropped == 0
     with pytest.raises(ConfigError):
-        run_every_frame(RecordedSequence(sequence_dir), MapperConfig(), 0, lambda *_: None)
+        run_every_frame(RecordedSequence(sequence_dir), IsdfConfig(), 0, lambda *_: None)
 
 
 def test_the_live_clock_keeps_to_its_budget_and_drops_frames(sequence_dir) -> None:
-    slow = replace(MapperConfig(), steps_per_frame=12)
+    slow = replace(IsdfConfig(), steps_per_frame=12)
     mapper, report = run_at_rate(RecordedSequence(sequence_dir), slow, 0.5, lambda *_: None)
     assert report.sequence_seconds == pytest.approx(1.2)
     assert 0.6 <= report.cpu_seconds < 1.0  # one step may overrun
@@ -135,7 +135,7 @@ def test_the_live_clock_keeps_to_its_budget_and_drops_frames(sequence_dir) -> No
 
 
 def test_the_step_clock_shows_the_frames_that_a_faster_machine_would_have_seen(sequence_dir) -> None:
-    config = replace(MapperConfig(), first_frame_steps=6, steps_per_frame=2, keyframe_steps=0)
+    config = replace(IsdfConfig(), first_frame_steps=6, steps_per_frame=2, keyframe_steps=0)
     arrived: list[int] = []
     mapper, report = run_at_steps(
         RecordedSequence(sequence_dir), config, 10.0, lambda _, n: arrived.append(n)
@@ -154,13 +154,25 @@ def test_watching_costs_the_mapper_no_time(sequence_dir) -> None:
         while time.process_time() < end:
             pass
 
-    _, report = run_at_rate(RecordedSequence(sequence_dir), MapperConfig(), 0.5, busy)
+    _, report = run_at_rate(RecordedSequence(sequence_dir), IsdfConfig(), 0.5, busy)
     assert 0.6 <= report.cpu_seconds < 1.0
 
 
 def test_map_then_query(sequence_dir, tmp_path, monkeypatch, capsys) -> None:
     out = tmp_path / "run"
-    run_cli(monkeypatch, "map", sequence_dir, "--out", out, "--steps-per-frame", 8, "--mesh-spacing", 0.1)
+    run_cli(
+        monkeypatch,
+        "map",
+        sequence_dir,
+        "--out",
+        out,
+        "--method",
+        "isdf",
+        "--steps-per-frame",
+        8,
+        "--mesh-spacing",
+        0.1,
+    )
     report = json.loads((out / "report.json").read_text())
     assert report["steps"] == 96 and report["frames_used"] == 12
     assert len(trimesh.load(out / "mesh.ply").faces) == report["mesh_faces"] > 100
@@ -170,7 +182,7 @@ def test_map_then_query(sequence_dir, tmp_path, monkeypatch, capsys) -> None:
     run_cli(monkeypatch, "query", out, "--points", tmp_path / "points.npy", "--out", tmp_path / "answers.npz")
     answers = np.load(tmp_path / "answers.npz")
     assert answers["distance"].shape == (100,) and answers["gradient"].shape == (100, 3)
-    field = Mapper.load(out / "map.safetensors").field()
+    field = IsdfMapper.load(out / "map.safetensors").field()
     expected = field.distance(torch.from_numpy(points.astype(np.float32)))
     np.testing.assert_allclose(answers["distance"], expected.numpy(), atol=1e-6)
     assert "100 points" in capsys.readouterr().out
@@ -207,7 +219,7 @@ def test_up_is_judged_from_how_the_camera_is_held() -> None:
 @pytest.mark.parametrize("name", ["seq_7scenes", "seq_tum_fr3_cabinet58"])
 def test_real_sequences_are_learned(name) -> None:
     sequence = RecordedSequence(Path(os.environ["ISDF_DATA_DIR"]) / name)
-    mapper = Mapper(replace(MapperConfig(), first_frame_steps=30, steps_per_frame=15, keyframe_steps=0))
+    mapper = IsdfMapper(replace(IsdfConfig(), first_frame_steps=30, steps_per_frame=15, keyframe_steps=0))
     picks = range(0, len(sequence), max(1, len(sequence) // 12))
     for index in picks:
         mapper.integrate(sequence[index])

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from isdf import DatasetError, FrameError, MapperConfig, PinholeCamera
+from isdf import DatasetError, FrameError, IsdfConfig, PinholeCamera
 from isdf.datasets import (
     DepthSequence,
     PolycamSequence,
@@ -230,7 +230,7 @@ def test_frames_where_tracking_was_lost_are_refused_and_passed_over(tmp_path) ->
     sequence = ScanNetSequence(tmp_path)
     with pytest.raises(FrameError, match="NaN or inf"):
         sequence[0]
-    mapper, report = run_every_frame(sequence, MapperConfig(), 1, lambda *_: None)
+    mapper, report = run_every_frame(sequence, IsdfConfig(), 1, lambda *_: None)
     assert list(report.frames_refused) == [0] and mapper.frames_seen == 2
     (tmp_path / "frames" / "pose" / "1.txt").unlink()
     with pytest.raises(FrameError, match="NaN or inf"):

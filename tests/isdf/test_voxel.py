@@ -19,7 +19,7 @@ from isdf import (
     ConfigError,
     DepthFrame,
     FrameError,
-    Mapper,
+    IsdfMapper,
     NotReadyError,
     PinholeCamera,
     query,
@@ -326,7 +326,7 @@ def test_a_saved_map_answers_as_before_and_goes_on(rooms, method, tmp_path) -> N
 def test_files_of_another_kind_are_named(rooms, tmp_path) -> None:
     path = tmp_path / "map.safetensors"
     mapped("kinectfusion", frames=1).save(path)
-    for cls in (Mapper, ExactMapper):
+    for cls in (IsdfMapper, ExactMapper):
         with pytest.raises(CheckpointError, match=r"isdf-kinectfusion-map.*load_map"):
             cls.load(path)
     path.write_bytes(path.read_bytes()[:200])

@@ -27,8 +27,8 @@ from .sampling import RayBatch, SamplingConfig, sample_rays
 
 
 @dataclass(frozen=True)
-class MapperConfig:
-    """Everything that shapes a map. `MapperConfig()` runs on a CPU; `paper()` and `released()` are the original.
+class IsdfConfig:
+    """Everything that shapes a map. `IsdfConfig()` runs on a CPU; `paper()` and `released()` are the original.
 
     The CPU preset is the same method with a narrower network and fewer, better-supervised samples: 20 rays a frame
     instead of 200, but the batch distance looks at 400 surface points of every frame, and the regions of the losses
@@ -78,7 +78,7 @@ class MapperConfig:
             raise ConfigError("numbers of steps must be zero or more")
 
     @classmethod
-    def paper(cls, **changes: Any) -> MapperConfig:
+    def paper(cls, **changes: Any) -> IsdfConfig:
         """The paper's text: 4 x 256, 200 rays a frame, 20 + 8 + 1 samples a ray. Seconds a step on a CPU."""
         full = cls(
             network=NetworkConfig(),
@@ -92,7 +92,7 @@ class MapperConfig:
         return replace(full, **changes)
 
     @classmethod
-    def released(cls, **changes: Any) -> MapperConfig:
+    def released(cls, **changes: Any) -> IsdfConfig:
         """The values behind the paper's published results: 6 hidden layers, 19 + 7 + 1 samples, tuned weights."""
         tuned = LossConfig(
             truncation=0.2937,
@@ -110,7 +110,7 @@ class MapperConfig:
         )
 
 
-class Mapper:
+class IsdfMapper:
     """Learns a signed distance field online.
 
     Call `integrate` with every new frame and, when there is time to spare, `step` or `run_for`; `field` gives an
@@ -121,8 +121,8 @@ class Mapper:
         device: where the network lives; the CPU is the reference.
     """
 
-    def __init__(self, config: MapperConfig | None = None, device: str | torch.device = "cpu") -> None:
-        self.config = config or MapperConfig()
+    def __init__(self, config: IsdfConfig | None = None, device: str | torch.device = "cpu") -> None:
+        self.config = config or IsdfConfig()
         self.device = torch.device(device)
         self.keyframes = KeyframeSet()
         self.frames_seen = 0
@@ -225,7 +225,7 @@ class Mapper:
         checkpoint.save(self, Path(path), note or {})
 
     @classmethod
-    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Mapper:
+    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> IsdfMapper:
         """Read a map written by `save`; training goes on exactly as it would have."""
         from . import checkpoint
 
@@ -281,7 +281,7 @@ class Mapper:
             self.keyframes.record(index, loss)
 
 
-def new_optimiser(network: SDFNetwork, config: MapperConfig) -> torch.optim.AdamW:
+def new_optimiser(network: SDFNetwork, config: IsdfConfig) -> torch.optim.AdamW:
     """AdamW with the configured rate and decay."""
     return torch.optim.AdamW(
         network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True

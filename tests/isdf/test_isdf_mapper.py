@@ -14,10 +14,10 @@ from isdf import (
     CheckpointError,
     ConfigError,
     FrameError,
+    IsdfConfig,
+    IsdfMapper,
     KeyframeConfig,
     LossConfig,
-    Mapper,
-    MapperConfig,
     NetworkConfig,
     NotReadyError,
     SamplingConfig,
@@ -27,7 +27,7 @@ from isdf.keyframes import KeyframeSet, explained_share, render_depth
 from isdf.meshing import zero_level_mesh
 from tests.isdf.rooms import furnished_orbit, furnished_room
 
-SMALL = MapperConfig(
+SMALL = IsdfConfig(
     network=NetworkConfig(width=32, input_scale=0.12),
     sampling=SamplingConfig(rays_per_frame=10, stratified=5, near_surface=3, extra_surface=40),
     first_frame_steps=5,
@@ -36,8 +36,8 @@ SMALL = MapperConfig(
 )
 
 
-def mapped(config: MapperConfig = SMALL, frames: int = 6) -> Mapper:
-    mapper = Mapper(config)
+def mapped(config: IsdfConfig = SMALL, frames: int = 6) -> IsdfMapper:
+    mapper = IsdfMapper(config)
     for frame in furnished_orbit(12)[:frames]:
         mapper.integrate(frame)
     return mapper
@@ -55,8 +55,8 @@ def visible_points(count: int = 4000) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def room_map() -> Mapper:
-    mapper = Mapper(replace(MapperConfig(), seed=3))
+def room_map() -> IsdfMapper:
+    mapper = IsdfMapper(replace(IsdfConfig(), seed=3))
     for _ in range(2):
         for frame in furnished_orbit(12):
             mapper.integrate(replace_time(frame, mapper.frames_seen / 10))
@@ -71,7 +71,7 @@ def replace_time(frame, time: float):
     )
 
 
-def test_it_learns_a_furnished_room(room_map: Mapper) -> None:
+def test_it_learns_a_furnished_room(room_map: IsdfMapper) -> None:
     points = visible_points()
     distance, gradient = room_map.field().distance_and_gradient(points)
     truth = furnished_room()(points)
@@ -83,7 +83,7 @@ def test_it_learns_a_furnished_room(room_map: Mapper) -> None:
     assert (gradient.norm(dim=-1) - 1).abs().mean() < 0.3
 
 
-def test_the_mesh_is_the_room(room_map: Mapper) -> None:
+def test_the_mesh_is_the_room(room_map: IsdfMapper) -> None:
     mesh = zero_level_mesh(room_map.field(), 0.08)
     assert len(mesh.faces) > 2000
     seen = torch.cat([frame.thinned(4, 12.0) for frame in furnished_orbit(12)])
@@ -93,7 +93,7 @@ def test_the_mesh_is_the_room(room_map: Mapper) -> None:
         zero_level_mesh(room_map.field(), 0.0005)
 
 
-def test_the_cost_field_is_the_cost_of_a_snapshot(room_map: Mapper) -> None:
+def test_the_cost_field_is_the_cost_of_a_snapshot(room_map: IsdfMapper) -> None:
     points = visible_points(240)
     cost, gradient = room_map.cost_field(0.5).cost_and_gradient(points)
     distance = room_map.field().distance(points)
@@ -104,7 +104,7 @@ def test_the_cost_field_is_the_cost_of_a_snapshot(room_map: Mapper) -> None:
 
 def test_a_frame_with_news_becomes_a_keyframe_and_the_same_view_does_not() -> None:
     frames = furnished_orbit(12)
-    mapper = Mapper(replace(SMALL, first_frame_steps=150, steps_per_frame=5))
+    mapper = IsdfMapper(replace(SMALL, first_frame_steps=150, steps_per_frame=5))
     mapper.integrate(frames[0])
     mapper.integrate(frames[0])
     assert len(mapper.keyframes) == 1
@@ -115,14 +115,14 @@ def test_a_frame_with_news_becomes_a_keyframe_and_the_same_view_does_not() -> No
 def test_a_keyframe_is_forced_after_the_time_limit() -> None:
     frame = furnished_orbit(12)[0]
     for gap, keyframes in ((4.9, 1), (5.1, 2)):
-        mapper = Mapper(replace(SMALL, first_frame_steps=150))
+        mapper = IsdfMapper(replace(SMALL, first_frame_steps=150))
         mapper.integrate(replace_time(frame, 0.0))
         mapper.integrate(replace_time(frame, gap))
         assert len(mapper.keyframes) == keyframes
 
 
 def test_information_gain_compares_with_the_frozen_copy_not_the_live_network() -> None:
-    mapper = Mapper(replace(SMALL, first_frame_steps=150))
+    mapper = IsdfMapper(replace(SMALL, first_frame_steps=150))
     frame = furnished_orbit(12)[0]
     mapper.integrate(frame)
     share = explained_share(mapper._frozen, frame, KeyframeConfig(), SamplingConfig(), torch.Generator())
@@ -161,16 +161,16 @@ def test_the_window_is_newest_last_keyframe_and_replayed() -> None:
 
 @pytest.mark.parametrize("bound", ["ray", "normal", "batch"])
 def test_every_bound_trains(bound) -> None:
-    mapper = Mapper(replace(SMALL, bound=bound, first_frame_steps=0))
+    mapper = IsdfMapper(replace(SMALL, bound=bound, first_frame_steps=0))
     mapper.integrate(furnished_orbit(12)[0])
     losses = [mapper.step() for _ in range(60)]
     assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:10])
 
 
 def test_the_papers_and_the_released_sizes_make_a_step() -> None:
-    for config in (MapperConfig.paper(), MapperConfig.released()):
+    for config in (IsdfConfig.paper(), IsdfConfig.released()):
         small = replace(config, sampling=replace(config.sampling, rays_per_frame=5), first_frame_steps=2)
-        mapper = Mapper(small)
+        mapper = IsdfMapper(small)
         mapper.integrate(furnished_orbit(12)[0])
         assert mapper.steps == 2 and mapper.network.config.width == 256
 
@@ -199,7 +199,12 @@ def test_an_unusable_frame_changes_nothing() -> None:
 
 
 def test_an_empty_map_says_what_to_do() -> None:
-    for ask in (Mapper().field, Mapper().step, lambda: Mapper().bounds, lambda: Mapper().save("/tmp/never")):
+    for ask in (
+        IsdfMapper().field,
+        IsdfMapper().step,
+        lambda: IsdfMapper().bounds,
+        lambda: IsdfMapper().save("/tmp/never"),
+    ):
         with pytest.raises(NotReadyError, match="integrate"):
             ask()
 
@@ -213,7 +218,7 @@ def test_the_same_seed_gives_the_same_map_and_another_seed_another() -> None:
 def test_saving_and_loading_continues_identically(tmp_path) -> None:
     mapper = mapped(replace(SMALL, losses=LossConfig(noise=0.04)))
     mapper.save(tmp_path / "map.safetensors")
-    loaded = Mapper.load(tmp_path / "map.safetensors")
+    loaded = IsdfMapper.load(tmp_path / "map.safetensors")
     assert loaded.config == mapper.config and loaded.steps == mapper.steps
     for frame in furnished_orbit(12)[6:]:
         mapper.integrate(frame)
@@ -241,28 +246,28 @@ def test_a_failed_save_leaves_the_old_file_and_no_litter(tmp_path, monkeypatch) 
 def test_foreign_damaged_and_newer_files_are_refused(tmp_path) -> None:
     path = tmp_path / "map.safetensors"
     with pytest.raises(CheckpointError, match="no such file"):
-        Mapper.load(path)
+        IsdfMapper.load(path)
     mapped().save(path)
     data = path.read_bytes()
     (tmp_path / "cut").write_bytes(data[: len(data) // 2])
     with pytest.raises(CheckpointError, match="not a readable map"):
-        Mapper.load(tmp_path / "cut")
+        IsdfMapper.load(tmp_path / "cut")
     save_file({"x": torch.zeros(1)}, tmp_path / "foreign")
     with pytest.raises(CheckpointError, match="not a map written by this package"):
-        Mapper.load(tmp_path / "foreign")
+        IsdfMapper.load(tmp_path / "foreign")
     with safe_open(path, "pt") as file:
         header = json.loads(file.metadata()["isdf"])
         tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
     save_file(tensors, tmp_path / "newer", {"isdf": json.dumps(header | {"version": 99})})
     with pytest.raises(CheckpointError, match="version 99"):
-        Mapper.load(tmp_path / "newer")
+        IsdfMapper.load(tmp_path / "newer")
     del tensors["network.layers.0.weight"]
     mapfile.write(tmp_path / "partial", tensors, header)
     with pytest.raises(CheckpointError, match="incomplete or inconsistent"):
-        Mapper.load(tmp_path / "partial")
+        IsdfMapper.load(tmp_path / "partial")
 
 
 @pytest.mark.parametrize("bad", [{"learning_rate": 0.0}, {"weight_decay": -1.0}, {"steps_per_frame": -1}])
 def test_impossible_configurations_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
-        MapperConfig(**bad)
+        IsdfConfig(**bad)

@@ -1,0 +1,217 @@
+"""Randomly furnished rooms, unlike the scenes that anything is measured in: what the completion network learns from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from robots.simulation import furniture as fn
+from robots.simulation.poses import planar_pose
+from robots.simulation.primitives import Box, Primitive
+
+KINDS = {"box": 0, "cylinder": 1, "sphere": 2}
+
+
+@dataclass(frozen=True)
+class RandomRoom:
+    """A room's solids as arrays: kind, rotation (3, 3) world to body, centre (3,), parameters (3,)."""
+
+    kind: np.ndarray
+    rotation: np.ndarray
+    centre: np.ndarray
+    parameters: np.ndarray
+    size: tuple[float, float, float]
+    yaw: float
+    floor: float
+    pieces: np.ndarray
+    """(n, 3) middle of the pieces of furniture [m]: what there is to look at."""
+
+
+def random_room(rng: np.random.Generator) -> RandomRoom:
+    """Walls, maybe a ceiling and inner walls with doorways, furniture by the walls and about the room, clutter."""
+    size = (float(rng.uniform(2.8, 9)), float(rng.uniform(2.8, 9)), float(rng.uniform(2.3, 3.2)))
+    solids: list[Primitive] = list(fn.room_shell(*size))
+    if rng.random() < 0.5:
+        solids.append(Box("ceiling", planar_pose(0, 0, size[2] + 0.06), (size[0] + 0.3, size[1] + 0.3, 0.12)))
+    for axis in range(2):
+        if size[axis] > 5 and rng.random() < 0.5:
+            solids += inner_wall(rng, size, axis)
+    pieces: list[np.ndarray] = []
+    for number in range(int(rng.integers(2, 6 + size[0] * size[1] / 3))):
+        place(rng, size, solids, pieces, f"piece{number}")
+    yaw = 0.0 if rng.random() < 0.6 else float(rng.uniform(-np.pi, np.pi))
+    # A random height of the floor, too: lattices of nodes must not learn where it lies between them.
+    T = planar_pose(0, 0, rng.uniform(0, 0.16), yaw)
+    turned = [solid.at(T @ solid.pose) for solid in solids]
+    centres = np.array(pieces).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+    return RandomRoom(
+        np.array([KINDS[s.kind] for s in turned]),
+        np.stack([s.pose[:3, :3].T for s in turned]),
+        np.stack([s.pose[:3, 3] for s in turned]),
+        np.array([s.parameters for s in turned], dtype=float),
+        size,
+        yaw,
+        float(T[2, 3]),
+        centres,
+    )
+
+
+def inner_wall(rng: np.random.Generator, size: tuple[float, float, float], axis: int) -> list[Primitive]:
+    """A wall across the room with a doorway, or only a part of one."""
+    at, width = rng.uniform(-0.25, 0.25) * size[axis], rng.uniform(0.8, 1.3)
+    half, height = size[1 - axis] / 2, size[2]
+    door = rng.uniform(-half + 0.2, half - width - 0.2)
+    spans = [(-half, door, 0.0), (door + width, half, 0.0)]
+    if rng.random() < 0.7:
+        spans.append((door, door + width, 2.05))
+    out: list[Primitive] = []
+    for number, (low, high, bottom) in enumerate(spans):
+        where, extent = [0.0, 0.0], [0.1, 0.1]
+        where[axis], where[1 - axis] = at, (low + high) / 2
+        extent[1 - axis] = high - low
+        pose = planar_pose(where[0], where[1], (bottom + height) / 2)
+        out.append(Box(f"inner{axis}.{number}", pose, (extent[0], extent[1], height - bottom)))
+    return out
+
+
+def place(
+    rng: np.random.Generator,
+    size: tuple[float, float, float],
+    solids: list[Primitive],
+    pieces: list[np.ndarray],
+    name: str,
+) -> None:
+    """Put one piece of furniture where no other stands, if a few tries find room for it."""
+    parts, width, depth, top = piece(rng, name)
+    for _ in range(8):
+        x, y = (rng.uniform(-0.5, 0.5) * (s - depth) for s in size[:2])
+        yaw = float(rng.choice([0, 0.5, 1, 1.5]) * np.pi + rng.normal(0, 0.1))
+        if rng.random() < 0.65:
+            wall = int(rng.integers(4))
+            yaw = float([0, np.pi, 0.5 * np.pi, -0.5 * np.pi][wall])
+            gap = depth / 2 + rng.uniform(0, 0.08)
+            x, y = [
+                (x, size[1] / 2 - gap), (x, gap - size[1] / 2), (gap - size[0] / 2, y), (size[0] / 2 - gap, y)
+            ][wall]  # fmt: skip
+        reach = 0.5 * max(width, depth)
+        if all(np.hypot(x - p[0], y - p[1]) > reach + 0.3 for p in pieces):
+            solids += fn.placed(parts, x, y, yaw)
+            pieces.append(np.array([x, y, 0.7 * top]))
+            solids += clutter(rng, name, x, y, yaw, width, depth, top)
+            return
+
+
+def clutter(rng, name, x, y, yaw, width, depth, top) -> list[Primitive]:
+    """A few small boxes on top of a piece."""
+    if top > 1.2 or rng.random() < 0.4:
+        return []
+    things: list[Primitive] = []
+    for number in range(int(rng.integers(1, 4))):
+        extent = rng.uniform(0.05, 0.35, 3)
+        a, b = rng.uniform(-0.35, 0.35) * width, rng.uniform(-0.35, 0.35) * depth
+        pose = planar_pose(a, b, top + extent[2] / 2, yaw=rng.uniform(0, 3))
+        things.append(Box(f"{name}.thing{number}", pose, tuple(extent)))
+    return list(fn.placed(tuple(things), x, y, yaw))
+
+
+def piece(rng: np.random.Generator, name: str) -> tuple[fn.Parts, float, float, float]:
+    """A random piece of furniture with its width, depth and height [m]."""
+    w, u = float(rng.uniform(0.6, 2.2)), float(rng.uniform(0.35, 1.0))
+    h = float(rng.uniform(0.35, 1.1))
+    tall = float(rng.uniform(0.8, 2.2))
+    kind = int(rng.integers(13))
+    if kind <= 2:
+        return fn.table(name, w, u, h, thickness=float(rng.uniform(0.02, 0.08))), w, u, h
+    if kind == 3:
+        return fn.round_table(name, u / 1.5, h), u * 1.3, u * 1.3, h
+    if kind == 4:
+        return fn.chair(name), 0.45, 0.45, 0.9
+    if kind == 5:
+        return fn.office_chair(name), 0.5, 0.5, 0.8
+    if kind == 6:
+        return fn.shelf(name, w, tall, boards=int(rng.integers(3, 7))), w, 0.32, tall
+    if kind == 7:
+        return fn.sofa(name, max(w, 0.8)), max(w, 0.8), 0.85, 0.85
+    if kind == 8:
+        return fn.cupboard(name, w, tall, max(0.3, 0.6 * u)), w, max(0.3, 0.6 * u), tall
+    if kind == 9:
+        return fn.counter(name, max(w, 1.0)), max(w, 1.0), 0.6, 0.9
+    if kind == 10:
+        return (fn.plant(name), 0.5, 0.5, 1.2) if rng.random() < 0.5 else (fn.floor_lamp(name), 0.3, 0.3, 1.6)
+    if kind == 11:
+        return fn.bed(name), 1.4, 2.1, 0.5
+    box = Box(name, planar_pose(0, 0, tall / 2), (w, u, tall))
+    return (box,), w, u, tall
+
+
+@njit(cache=True)
+@no_type_check
+def solid_distance(kind, p, x, y, z):
+    """Signed distance of one solid at a point in its own frame."""
+    if kind == 0:
+        a, b, c = abs(x) - p[0], abs(y) - p[1], abs(z) - p[2]
+        outside = np.sqrt(max(a, 0.0) ** 2 + max(b, 0.0) ** 2 + max(c, 0.0) ** 2)
+        return outside + min(max(a, b, c), 0.0)
+    if kind == 1:
+        a, b = np.sqrt(x * x + y * y) - p[0], abs(z) - p[1]
+        return np.sqrt(max(a, 0.0) ** 2 + max(b, 0.0) ** 2) + min(max(a, b), 0.0)
+    return np.sqrt(x * x + y * y + z * z) - p[0]
+
+
+@njit(cache=True)
+@no_type_check
+def scene_distance(kinds, rotation, centre, parameters, points):
+    """Signed distance (n,) to the union of all solids at points (n, 3)."""
+    out = np.full(len(points), 1e9)
+    for n in range(len(points)):
+        for s in range(len(kinds)):
+            d = points[n] - centre[s]
+            R = rotation[s]
+            x = R[0, 0] * d[0] + R[0, 1] * d[1] + R[0, 2] * d[2]
+            y = R[1, 0] * d[0] + R[1, 1] * d[1] + R[1, 2] * d[2]
+            z = R[2, 0] * d[0] + R[2, 1] * d[1] + R[2, 2] * d[2]
+            out[n] = min(out[n], solid_distance(kinds[s], parameters[s], x, y, z))
+    return out
+
+
+@njit(cache=True)
+@no_type_check
+def depth_image(kinds, rotation, centre, parameters, T, intrinsics, height, width, near, far):
+    """z-depth image (height, width) by sphere tracing; 0 where nothing lies between near and far [m]."""
+    fx, fy, cx, cy = intrinsics
+    depth = np.zeros((height, width), dtype=np.float32)
+    close = np.empty(len(kinds))
+    for v in range(height):
+        for u in range(width):
+            a, b = (u - cx) / fx, (v - cy) / fy
+            ray = T[:3, 0] * a + T[:3, 1] * b + T[:3, 2]
+            length = np.sqrt(a * a + b * b + 1)
+            along = 0.0
+            close[:] = -1.0
+            for _ in range(96):
+                p = T[:3, 3] + ray * (along / length)
+                d = 1e9
+                for s in range(len(kinds)):
+                    # No solid is nearer than it was, less the way made since: most need not be looked at again.
+                    if close[s] - along >= d:
+                        continue
+                    q = p - centre[s]
+                    R = rotation[s]
+                    here = solid_distance(
+                        kinds[s], parameters[s],
+                        R[0, 0] * q[0] + R[0, 1] * q[1] + R[0, 2] * q[2],
+                        R[1, 0] * q[0] + R[1, 1] * q[1] + R[1, 2] * q[2],
+                        R[2, 0] * q[0] + R[2, 1] * q[1] + R[2, 2] * q[2],
+                    )  # fmt: skip
+                    close[s] = along + here
+                    d = min(d, here)
+                along += d
+                if d < 2e-3 or along > far * length:
+                    break
+            z = along / length
+            if near <= z <= far and d < 1e-2:
+                depth[v, u] = z
+    return depth

@@ -1,0 +1,207 @@
+"""The distance field that answers queries: a two-level lattice of values and confidences."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Int8, UInt8
+from numba import njit
+from torch import Tensor
+
+from ..field import GridField, _AnalyticGradient, bake, check_points
+from .lattice import FINE, STEP, LatticeArrays
+
+# Below this many points a second thread costs more than it saves.
+PARALLEL = 20_000
+
+
+class LatticeField:
+    """Piecewise trilinear distances with confidences; immutable.
+
+    Outside the lattice the distance is that of the closest point on its rim, and the gradient across it is zero.
+
+    Args:
+        value: (nx, ny, nz) signed distances at the coarse nodes [m].
+        confidence: of the same nodes, 255 is 1.
+        block: of the same nodes: number of the cell's corrections, -1 where there are none.
+        corrections: (n, 125) what trilinear interpolation misses at the fine nodes of a cell, in `lattice.STEP`s.
+        corner: (3,) lattice index of the first node.
+        spacing: of coarse nodes [m].
+        bounds: (2, 3) lower and upper corner of what was observed [m].
+    """
+
+    def __init__(
+        self,
+        value: Float[np.ndarray, "nx ny nz"],
+        confidence: UInt8[np.ndarray, "nx ny nz"],
+        block: Int[np.ndarray, "nx ny nz"],
+        corrections: Int8[np.ndarray, "n 125"],
+        corner: Int[np.ndarray, "3"],
+        spacing: float,
+        bounds: Float[Tensor, "2 3"],
+    ) -> None:
+        self._value, self._confidence, self._block, self._corrections = value, confidence, block, corrections
+        self._origin, self.spacing = np.asarray(corner) * spacing, float(spacing)
+        self.bounds = bounds.clone()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all that queries need [bytes]."""
+        return sum(a.nbytes for a in (self._value, self._confidence, self._block, self._corrections))
+
+    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Signed distance [m] at world points [m], positive outside; differentiable by autograd."""
+        check_points(points)
+        if torch.is_grad_enabled() and points.requires_grad:
+            return _AnalyticGradient.apply(points, self)
+        return self.distance_and_gradient(points)[0]
+
+    def distance_and_gradient(
+        self, points: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Signed distance [m] and the exact gradient of the interpolant at world points [m]; no autograd graph."""
+        check_points(points)
+        flat = points.detach().cpu().numpy().reshape(-1, 3)
+        distance, gradient = np.empty(len(flat), np.float32), np.empty((len(flat), 3), np.float32)
+        self._split(_query, flat, distance, gradient)
+        return (
+            torch.from_numpy(distance).to(points).view(points.shape[:-1]),
+            torch.from_numpy(gradient).to(points).view(points.shape),
+        )
+
+    def confidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Estimated probability that the distance at a world point [m] is wrong by less than 5 cm."""
+        check_points(points)
+        flat = points.detach().cpu().numpy().reshape(-1, 3)
+        out = np.empty(len(flat), np.float32)
+        _confidence(flat, self._origin, self.spacing, self._confidence, out)
+        return torch.from_numpy(out).to(points).view(points.shape[:-1])
+
+    def bake(
+        self, spacing: float = 0.05, bounds: Float[Tensor, "2 3"] | None = None, padding: float = 0.2
+    ) -> GridField:
+        """Sample the field on a regular grid.
+
+        Args:
+            spacing: distance of grid points [m].
+            bounds: (2, 3) region [m]; by default what was observed.
+            padding: added on every side [m].
+        """
+        return bake(self, self.bounds if bounds is None else bounds, spacing, padding)
+
+    def _split(self, kernel: Any, points: np.ndarray, distance: np.ndarray, gradient: np.ndarray) -> None:
+        """Run a kernel over the points in as many threads as torch uses."""
+        state = (self._origin, self.spacing, self._value, self._block, self._corrections)
+        threads = torch.get_num_threads()
+        if threads == 1 or len(points) < PARALLEL:
+            kernel(points, *state, distance, gradient)
+            return
+        parts = zip(*(np.array_split(a, threads) for a in (points, distance, gradient)), strict=True)
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(lambda part: kernel(part[0], *state, *part[1:]), parts))
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _query(points, origin, spacing, value, block, corrections, distance, gradient):
+    """Distances (n,) and gradients (n, 3) of points (n, 3), written in place."""
+    nx, ny, nz = value.shape
+    parts = FINE - 1
+    per = np.float32(1 / spacing)
+    scale = np.float32(STEP)
+    for n in range(points.shape[0]):
+        x = np.float32((points[n, 0] - origin[0]) / spacing)
+        y = np.float32((points[n, 1] - origin[1]) / spacing)
+        z = np.float32((points[n, 2] - origin[2]) / spacing)
+        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+            distance[n] = np.nan
+            gradient[n, 0], gradient[n, 1], gradient[n, 2] = np.nan, np.nan, np.nan
+            continue
+        cx = min(max(x, np.float32(0)), np.float32(nx - 1))
+        cy = min(max(y, np.float32(0)), np.float32(ny - 1))
+        cz = min(max(z, np.float32(0)), np.float32(nz - 1))
+        i, j, k = min(int(cx), nx - 2), min(int(cy), ny - 2), min(int(cz), nz - 2)
+        tx, ty, tz = cx - np.float32(i), cy - np.float32(j), cz - np.float32(k)
+        d, gx, gy, gz = _trilinear(
+            value[i, j, k], value[i, j, k + 1], value[i, j + 1, k], value[i, j + 1, k + 1],
+            value[i + 1, j, k], value[i + 1, j, k + 1], value[i + 1, j + 1, k], value[i + 1, j + 1, k + 1],
+            tx, ty, tz,
+        )  # fmt: skip
+        m = block[i, j, k]
+        if m >= 0:
+            tx, ty, tz = tx * parts, ty * parts, tz * parts
+            a, b, c = min(int(tx), parts - 1), min(int(ty), parts - 1), min(int(tz), parts - 1)
+            at = a * FINE * FINE + b * FINE + c
+            f = corrections[m]
+            e, ex, ey, ez = _trilinear(
+                np.float32(f[at]), np.float32(f[at + 1]), np.float32(f[at + FINE]), np.float32(f[at + FINE + 1]),
+                np.float32(f[at + FINE * FINE]), np.float32(f[at + FINE * FINE + 1]),
+                np.float32(f[at + FINE * FINE + FINE]), np.float32(f[at + FINE * FINE + FINE + 1]),
+                tx - np.float32(a), ty - np.float32(b), tz - np.float32(c),
+            )  # fmt: skip
+            d += scale * e
+            gx, gy, gz = gx + scale * parts * ex, gy + scale * parts * ey, gz + scale * parts * ez
+        distance[n] = d
+        gradient[n, 0] = gx * per if cx == x else 0.0
+        gradient[n, 1] = gy * per if cy == y else 0.0
+        gradient[n, 2] = gz * per if cz == z else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+@no_type_check
+def _trilinear(v000, v001, v010, v011, v100, v101, v110, v111, x, y, z):
+    """Value of trilinear interpolation at (x, y, z) in [0, 1]^3 and its three derivatives."""
+    a00, a01, a10, a11 = v001 - v000, v011 - v010, v101 - v100, v111 - v110
+    e00, e01, e10, e11 = v000 + a00 * z, v010 + a01 * z, v100 + a10 * z, v110 + a11 * z
+    b0, b1 = e01 - e00, e11 - e10
+    f0, f1 = e00 + b0 * y, e10 + b1 * y
+    z0, z1 = a00 + (a01 - a00) * y, a10 + (a11 - a10) * y
+    return f0 + (f1 - f0) * x, f1 - f0, b0 + (b1 - b0) * x, z0 + (z1 - z0) * x
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _confidence(points, origin, spacing, confidence, out):
+    """Trilinear confidences (n,) of points (n, 3), 0 outside the lattice and where a point is not finite."""
+    nx, ny, nz = confidence.shape
+    for n in range(points.shape[0]):
+        x = (points[n, 0] - origin[0]) / spacing
+        y = (points[n, 1] - origin[1]) / spacing
+        z = (points[n, 2] - origin[2]) / spacing
+        if not (0 <= x <= nx - 1 and 0 <= y <= ny - 1 and 0 <= z <= nz - 1):
+            out[n] = 0.0
+            continue
+        i, j, k = min(int(x), nx - 2), min(int(y), ny - 2), min(int(z), nz - 2)
+        tx, ty, tz = x - i, y - j, z - k
+        total = 0.0
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    w = (tx if a else 1 - tx) * (ty if b else 1 - ty) * (tz if c else 1 - tz)
+                    total += w * confidence[i + a, j + b, k + c]
+        out[n] = total / 255
+
+
+@njit(cache=True)
+@no_type_check
+def query_one(lattice: LatticeArrays, point):
+    """Distance [m] at a point (3,) by the coarse nodes; confidence (0 .. 255) and looked through of the closest."""
+    at, t = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.float32)
+    for axis in range(3):
+        place = (point[axis] - lattice.origin[axis]) / lattice.spacing
+        if not 0 <= place < lattice.value.shape[axis] - 1:
+            return np.float32(0), 0, False
+        at[axis] = int(place)
+        t[axis] = place - at[axis]
+    i, j, k = at
+    v = lattice.value
+    value, _, _, _ = _trilinear(
+        v[i, j, k], v[i, j, k + 1], v[i, j + 1, k], v[i, j + 1, k + 1],
+        v[i + 1, j, k], v[i + 1, j, k + 1], v[i + 1, j + 1, k], v[i + 1, j + 1, k + 1],
+        t[0], t[1], t[2],
+    )  # fmt: skip
+    i, j, k = i + int(t[0] > 0.5), j + int(t[1] > 0.5), k + int(t[2] > 0.5)
+    return value, int(lattice.confidence[i, j, k]), lattice.evidence[i, j, k] > 127

@@ -1,0 +1,338 @@
+"""The default map: distances between what the views prove, guessed by a network where they leave a gap."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import PinholeCamera
+from ..cost import CostField
+from ..errors import ConfigError, FrameError, NotReadyError
+from ..extent import grown, nothing_seen
+from ..frames import DepthFrame
+from .agreement import compare
+from .bricks import BrickVolume, missing_bricks
+from .completion import load_network
+from .evidence import look_through
+from .field import LatticeField
+from .fusion import fuse
+from .lattice import Lattice
+from .refresh import guess, refresh
+
+logger = logging.getLogger(__name__)
+
+# Fine voxels between the nodes of the coarse lattice.
+RATIO = 4
+# The map reaches this far beyond what was seen, across and along the vertical [m].
+BEYOND_ACROSS, BEYOND_ALONG = 2.5, 1.5
+# Distances are written anew this far outside what a frame looked at [m].
+MARGIN = 0.8
+# A frame is passed over when more than this share of at least so many points contradicts the map, but no more than
+# so many frames in a row: then the world has changed, not the frame.
+CONTRADICTED, JUDGED, PATIENCE = 0.35, 60, 5
+# Columns of an image that are compared with the map.
+COLUMNS = 80
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """Settings of the default map.
+
+    Args:
+        voxel: edge of a fine voxel [m]; the coarse nodes lie four of them apart, and the network knows no other.
+        truncation: least truncation of the fused distances [m].
+        truncation_noise: truncation per squared depth [m / m^2]: it follows the noise of far depth.
+        max_depth: pixels measured farther than this are ignored [m].
+        max_weight: of a voxel, in measurements at 1 m: enough to average the noise.
+        refresh_period: least frame time between two refreshes of the distances [s].
+        guess_period: least frame time between two runs of the network [s].
+        max_bricks: a frame that needs a larger table of bricks (of eight voxels a side) is refused.
+    """
+
+    voxel: float = 0.04
+    truncation: float = 0.12
+    truncation_noise: float = 0.012
+    max_depth: float = 10.0
+    max_weight: float = 20.0
+    refresh_period: float = 0.35
+    guess_period: float = 1.0
+    max_bricks: int = 8_000_000
+
+    def __post_init__(self) -> None:
+        for name in ("voxel", "truncation", "max_depth", "max_weight", "max_bricks"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if not self.truncation > 2 * self.voxel:
+            raise ConfigError(
+                f"truncation must be more than two voxels, got {self.truncation} m with a voxel of {self.voxel} m"
+            )
+        for name in ("refresh_period", "guess_period", "truncation_noise"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must be zero or more, got {getattr(self, name)}")
+
+
+class Mapper:
+    """Maps posed depth images online: fuse each, write distances down now and then, guess between bounds.
+
+    `integrate` fuses at once and refreshes the distances when `refresh_period` of frame time has passed; `step` and
+    `run_for` refresh whatever came in since. Frames that contradict the map or repeat the last image are passed over
+    with a line in the log.
+
+    Args:
+        config: see `MapperConfig`.
+        device: where the network runs; everything else runs on the CPU.
+    """
+
+    def __init__(self, config: MapperConfig | None = None, device: str | torch.device = "cpu") -> None:
+        compile_kernels()
+        self._begin(config or MapperConfig(), torch.device(device))
+
+    def _begin(self, config: MapperConfig, device: torch.device) -> None:
+        self.config, self.device = config, device
+        self.bricks = BrickVolume(self.config.voxel, self.config.max_bricks)
+        self.lattice = Lattice(RATIO * self.config.voxel)
+        self.network = load_network().to(self.device)
+        self.frames_seen = self.frames_skipped = self.steps = 0
+        self.up = np.zeros(3)
+        self._bounds = nothing_seen()
+        self._viewed: np.ndarray | None = None
+        self._refreshed_at = self._guessed_at = -math.inf
+        self._ready = False
+        self._last: np.ndarray | None = None
+        self._frozen, self._refused = False, 0
+
+    @property
+    def bounds(self) -> Float[Tensor, "2 3"]:
+        """Lower and upper corner [m] of the surfaces and cameras seen so far; NotReadyError before the first."""
+        if self.frames_seen == 0:
+            raise NotReadyError("nothing was seen yet: call mapper.integrate(frame) first")
+        return self._bounds.clone()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all that mapping goes on from, without the network [bytes]."""
+        return self.bricks.nbytes + self.lattice.nbytes
+
+    def integrate(self, frame: Any) -> None:
+        """Fuse a new frame, and refresh the distances when they are due.
+
+        Args:
+            frame: an `isdf.DepthFrame`, or any object with its attributes.
+
+        Raises:
+            FrameError: the frame cannot be used; the map is as it was before the call.
+        """
+        frame = DepthFrame.of(frame).to(torch.device("cpu"))
+        depth, T = self._usable(frame), frame.T_world_camera.numpy()
+        if self._repeats(depth, frame.time):
+            return
+        stride = max(1, depth.shape[1] // COLUMNS)
+        appeared = self._appeared(depth, T, stride, frame)
+        if appeared is None:
+            return
+        box = self._view(depth, T, frame)
+        self.bricks.include(box[0], box[1])
+        self._bounds = grown(self._bounds, frame, self.config.max_depth)
+        self.up -= T[:3, 1]
+        beyond = np.full(3, BEYOND_ACROSS)
+        beyond[np.abs(self.up).argmax()] = BEYOND_ALONG
+        seen = self._bounds.numpy().astype(float)
+        self.lattice.include(np.minimum(seen[0] - beyond, box[0]), np.maximum(seen[1] + beyond, box[1]))
+        self._fuse(depth, T, frame, box, appeared, stride)
+        self.frames_seen += 1
+        self._touch(box + np.array([[-MARGIN], [MARGIN]]))
+        # A clock that stands still or jumps back must not stop the refreshing.
+        if not self._ready or not 0 < frame.time - self._guessed_at < self.config.guess_period:
+            self._guess(T[:3, 3])
+            self._guessed_at = frame.time
+        if not self._ready or not 0 < frame.time - self._refreshed_at < self.config.refresh_period:
+            self.refresh()
+            self._refreshed_at = frame.time
+
+    def refresh(self) -> None:
+        """Bring the distances up to date with all frames so far."""
+        if self._viewed is not None and refresh(self.lattice, self.bricks, self._viewed):
+            self._viewed, self._ready = None, True
+            self.steps += 1
+
+    def step(self) -> float:
+        """The same as `refresh`; there is no loss to return, so it is 0."""
+        self.refresh()
+        return 0.0
+
+    def run_for(self, cpu_seconds: float) -> int:
+        """Refresh if a frame came in since the last time; returns how often: 0 or 1, for there is no more to gain."""
+        before = self.steps
+        end = time.process_time() + cpu_seconds
+        while self._viewed is not None and self.steps == before and time.process_time() < end:
+            self.refresh()
+        return self.steps - before
+
+    def field(self) -> LatticeField:
+        """An immutable snapshot of the distance field, at most `refresh_period` of frame time old.
+
+        Raises:
+            NotReadyError: no frame was integrated yet, or none showed a surface.
+        """
+        if not self._ready:
+            raise NotReadyError("no surface was seen yet: call mapper.integrate(frame) first")
+        lattice = self.lattice
+        return LatticeField(
+            lattice.value.copy(),
+            lattice.confidence.copy(),
+            lattice.block.copy(),
+            lattice.corrections[: lattice.used].copy(),
+            lattice.corner.copy(),
+            lattice.spacing,
+            self._bounds,
+        )
+
+    def cost_field(self, eps: float) -> CostField:
+        """The CHOMP collision cost c(f(x)) with reach `eps` [m], over a snapshot of the field."""
+        return CostField(self.field(), eps)
+
+    def save(self, path: str | Path, note: Mapping[str, Any] | None = None) -> None:
+        """Write everything to go on from to one file, atomically, after a `refresh`; `note` goes into its header."""
+        from . import state
+
+        state.save(self, Path(path), note or {})
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Mapper:
+        """Read a map written by `save`."""
+        from . import state
+
+        return state.load(Path(path), device)
+
+    def _usable(self, frame: DepthFrame) -> Float[np.ndarray, "h w"]:
+        depth = frame.depth.numpy()
+        depth = np.where(depth <= self.config.max_depth, depth, np.float32(0))
+        if not depth.any():
+            raise FrameError(
+                f"no pixel of the frame is within max_depth = {self.config.max_depth} m; raise it, or skip this frame"
+            )
+        return depth
+
+    def _repeats(self, depth: Float[np.ndarray, "h w"], when: float) -> bool:
+        """Whether the image is the last one again: a camera that hangs, whatever its pose says."""
+        same = self._last is not None and np.array_equal(depth, self._last)
+        self._last = depth
+        if same and not self._frozen:
+            logger.warning(
+                "at %.2f s the depth image repeats the last one: the camera hangs; passed over", when
+            )
+        elif self._frozen and not same:
+            logger.warning("at %.2f s the camera is back", when)
+        self._frozen = same
+        self.frames_skipped += same
+        return same
+
+    def _appeared(
+        self, depth: Float[np.ndarray, "h w"], T: Float[np.ndarray, "4 4"], stride: int, frame: DepthFrame
+    ) -> np.ndarray | None:
+        """Where something stands in space known to be free; None if the frame is to be passed over."""
+        if not self._ready:
+            return np.zeros((-(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), dtype=bool)
+        appeared, contradicted, known = compare(
+            self.lattice.arrays, self.bricks.arrays, depth, stride, _intrinsics(frame), T
+        )
+        if known >= JUDGED and contradicted > CONTRADICTED and self._refused < PATIENCE:
+            self._refused += 1
+            self.frames_skipped += 1
+            logger.warning(
+                "at %.2f s %.0f %% of the depth image contradict the map: a jump of the pose? passed over",
+                frame.time,
+                100 * contradicted,
+            )
+            return None
+        self._refused = 0
+        return appeared
+
+    def _view(
+        self, depth: Float[np.ndarray, "h w"], T: Float[np.ndarray, "4 4"], frame: DepthFrame
+    ) -> np.ndarray:
+        """Corners (2, 3) [m] of the box that holds the camera and all it sees, to the end of the truncation."""
+        stride = max(1, depth.shape[1] // COLUMNS)
+        v, u = np.nonzero(depth[::stride, ::stride])
+        z = depth[::stride, ::stride][v, u]
+        band = np.maximum(self.config.truncation, self.config.truncation_noise * z * z)
+        # The farthest pixel counts, whatever the stride: it decides whether every brick has a place in the table.
+        z = z + band + 0.1 + (depth.max() - z) * (z == z.max())
+        camera = frame.camera
+        rays = np.stack(
+            [(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1
+        )
+        points = (rays * z[:, None]) @ T[:3, :3].T + T[:3, 3]
+        return np.stack([np.minimum(points.min(axis=0), T[:3, 3]), np.maximum(points.max(axis=0), T[:3, 3])])
+
+    def _fuse(
+        self,
+        depth: Float[np.ndarray, "h w"],
+        T: Float[np.ndarray, "4 4"],
+        frame: DepthFrame,
+        box: np.ndarray,
+        appeared: np.ndarray,
+        stride: int,
+    ) -> None:
+        config, bricks, lattice, intrinsics = self.config, self.bricks, self.lattice, _intrinsics(frame)
+        band = (config.truncation_noise, config.truncation)
+        # At the far end of the range neighbouring rays are still closer than half a brick.
+        sparse = max(1, int(4 * config.voxel * frame.camera.fx / config.max_depth))
+        bricks.add(missing_bricks(bricks.arrays, depth, sparse, *band, intrinsics, T))
+        inverse = np.linalg.inv(T)
+        fuse(bricks.arrays, *bricks.box(*box), depth, *band, config.max_weight, intrinsics, inverse)
+        begin, end = lattice.window(*box)
+        look_through(
+            lattice.evidence,
+            lattice.corner,
+            lattice.spacing,
+            begin,
+            end,
+            depth,
+            appeared,
+            stride,
+            intrinsics,
+            inverse,
+        )
+
+    def _guess(self, eye: Float[np.ndarray, "3"]) -> None:
+        box = guess(self.lattice, self.bricks, self.network, eye, self.up)
+        if box is not None:
+            self._touch(box)
+
+    def _touch(self, box: np.ndarray) -> None:
+        """Have a box (2, 3) [m] refreshed with the next refresh."""
+        old = box if self._viewed is None else self._viewed
+        self._viewed = np.stack([np.minimum(old[0], box[0]), np.maximum(old[1], box[1])])
+
+
+@functools.cache
+def compile_kernels() -> None:
+    """Compile everything that runs later, so that no frame waits for it."""
+    camera = PinholeCamera(12.0, 12.0, 7.5, 5.5, 16, 12)
+    mapper = object.__new__(Mapper)
+    mapper._begin(MapperConfig(), torch.device("cpu"))
+    for index in range(2):
+        depth = torch.full((12, 16), 1.0 + 0.01 * index)
+        depth[4:8, 4:8] -= 0.3
+        mapper.integrate(DepthFrame(depth, torch.eye(4), camera, time=float(2 * index)))
+    field = mapper.field()
+    for dtype in (torch.float32, torch.float64):
+        field.distance_and_gradient(torch.zeros(1, 3, dtype=dtype))
+        field.confidence(torch.zeros(1, 3, dtype=dtype))
+
+
+def _intrinsics(frame: DepthFrame) -> tuple[float, float, float, float]:
+    camera = frame.camera
+    return float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)

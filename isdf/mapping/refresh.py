@@ -1,0 +1,123 @@
+"""Bringing the lattice up to date in a window: guesses by the network, then distances by the seeds."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .bricks import BrickVolume
+from .completion import STRIDE, CompletionNet, features
+from .evidence import gather
+from .lattice import Lattice
+from .nearest import nearest_points
+from .seeds import surface_seeds
+from .values import Patches, Window, cells_to_refine, coarse_values, refined_values
+
+# Surfaces this far outside a window still count in it [m].
+MARGIN = 2.5
+# Box about the camera in which distances are guessed: half its sides across and along the vertical [m].
+GUESS_ACROSS, GUESS_ALONG = 4.48, 2.56
+# Radius of the patch of surface about a seed [voxels]: closes the gaps between the seeds of neighbouring voxels.
+PATCH = 0.5
+
+Box = Float[np.ndarray, "2 3"]
+
+
+def guess(
+    lattice: Lattice,
+    bricks: BrickVolume,
+    network: CompletionNet,
+    eye: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"],
+) -> Box | None:
+    """Run the network in a box about the camera and keep its answers in the lattice.
+
+    Args:
+        lattice: its `share` and `width` are changed.
+        bricks: the surfaces.
+        network: on any device.
+        eye: the camera's position [m].
+        up: any vector whose largest component tells the vertical and its sign the way up.
+
+    Returns:
+        The box [m] that is to be refreshed, or None where there was nothing to go by.
+    """
+    vertical = int(np.abs(up).argmax())
+    reach = np.full(3, GUESS_ACROSS)
+    reach[vertical] = GUESS_ALONG
+    begin, end = lattice.window(eye - reach, eye + reach)
+    end = begin + (end - begin) // STRIDE * STRIDE
+    seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))
+    if len(seeds) == 0 or (end <= begin).any():
+        return None
+    part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
+    # The network knows the vertical as the last axis, upwards.
+    order = [axis for axis in range(3) if axis != vertical] + [vertical]
+    evidence, corner, seeds = (
+        lattice.evidence[part].transpose(order),
+        (lattice.corner + begin)[order],
+        seeds[:, order],
+    )
+    upside_down = up[vertical] < 0
+    if upside_down:
+        evidence, seeds = evidence[:, :, ::-1], seeds * np.array([1, 1, -1], dtype=np.float32)
+        corner[2] = -(corner[2] + evidence.shape[2] - 1)
+    proven = gather(np.ascontiguousarray(seeds), np.ascontiguousarray(evidence), corner, lattice.spacing)
+    for name, answer in zip(("share", "width"), _run(network, features(proven)), strict=True):
+        answer = answer[:, :, ::-1] if upside_down else answer
+        getattr(lattice, name)[part] = answer.transpose(np.argsort(order))
+    return lattice.spacing * np.stack([lattice.corner + begin, lattice.corner + end - 1])
+
+
+def _run(network: CompletionNet, x: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    device = next(network.parameters()).device
+    with torch.no_grad():
+        share, width = network(x[None].to(device))
+    return share[0].cpu().numpy(), width[0].cpu().numpy()
+
+
+def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
+    """Write the distances and confidences in a box [m] anew; False while there is no surface to measure from."""
+    begin, end = lattice.window(box[0], box[1])
+    low, high = (lattice.spacing * (lattice.corner + n) for n in (begin, end))
+    centre, normal, weight = surface_seeds(bricks.arrays, *bricks.box(low - MARGIN, high + MARGIN))
+    if len(centre) == 0:
+        return False
+    ratio = round(lattice.spacing / bricks.voxel)
+    # Nearest seeds are found for every second fine node; the others choose among those around them.
+    half = ratio // 2
+    nx, ny, nz = ((end - begin - 1) * half + 1).tolist()
+    places = (centre / np.float32(2 * bricks.voxel) - (lattice.corner + begin) * half).astype(np.float32)
+    nearest, _ = nearest_points(places, (nx, ny, nz), 1)
+    patches = Patches(centre, normal, weight, PATCH * bricks.voxel, nearest)
+    part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
+    proven = gather(
+        centre, np.ascontiguousarray(lattice.evidence[part]), lattice.corner + begin, lattice.spacing
+    )
+    window = Window(
+        first=lattice.corner + begin,
+        ratio=ratio,
+        evidence=np.ascontiguousarray(lattice.evidence[part]),
+        lower=proven.lower,
+        share=lattice.share[part].astype(np.float32),
+        width=lattice.width[part].astype(np.float32),
+        value=np.empty(proven.lower.shape, dtype=np.float32),
+        confidence=np.empty(proven.lower.shape, dtype=np.uint8),
+        state=np.empty(proven.lower.shape, dtype=np.int8),
+        taken=np.empty(proven.lower.shape, dtype=np.float32),
+        block=lattice.block[part].copy(),
+    )
+    coarse_values(window, patches, bricks.arrays)
+    lattice.value[part], lattice.confidence[part] = window.value, window.confidence
+    refine, stale = np.zeros_like(window.block, dtype=np.bool_), np.zeros_like(window.block, dtype=np.bool_)
+    cells_to_refine(window, patches, bricks.arrays, lattice.corrections, refine, stale)
+    # The window's last nodes belong to cells that reach out of it: those stay as they are.
+    inner = np.zeros_like(refine)
+    inner[:-1, :-1, :-1] = True
+    fresh = lattice.reassign(window.block, refine & inner, ~refine & inner)
+    cells = np.argwhere(inner & (window.block >= 0) & (fresh | stale))
+    refined_values(window, patches, bricks.arrays, cells, lattice.corrections)
+    lattice.block[part] = window.block
+    return True

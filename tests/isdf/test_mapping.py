@@ -1,0 +1,309 @@
+"""The default map: exact where seen, between proven bounds elsewhere, honest about it, and hard to upset."""
+
+import json
+import logging
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from isdf import (
+    CheckpointError,
+    ConfigError,
+    DepthFrame,
+    FrameError,
+    Mapper,
+    MapperConfig,
+    NotReadyError,
+    PinholeCamera,
+)
+from isdf.cli import main
+from isdf.datasets import SequenceWriter
+from isdf.evaluation import roc_area
+from isdf.mapping.completion import CHANNELS, load_network
+from isdf.mapping.evidence import gather
+from isdf.mapping.nearest import nearest_points
+from isdf.mapping.seeds import surface_seeds
+from isdf.methods import load_map
+from tests.gradients import assert_gradient_matches
+from tests.isdf.rooms import box, furnished_orbit, furnished_room, look_at, render, union
+
+CAMERA = PinholeCamera.from_fov(80, 60, math.radians(70))
+
+
+@pytest.fixture(scope="module")
+def orbit():
+    mapper = Mapper()
+    for frame in furnished_orbit(16):
+        mapper.integrate(frame)
+    mapper.refresh()
+    return mapper
+
+
+def visible_points(frames, count, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    points = []
+    for frame in frames:
+        surface = frame.thinned(1, 10.0)
+        surface = surface[torch.randint(len(surface), (count,), generator=generator)]
+        eye = frame.T_world_camera[:3, 3].float()
+        points.append(eye + torch.rand(count, 1, generator=generator) * (surface - eye))
+    return torch.cat(points)
+
+
+def room_points(count=4000):
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(3)) * torch.tensor(
+        [5, 4, 2.5]
+    ) - torch.tensor([2.5, 2.0, 0.0])
+
+
+def test_it_is_exact_where_the_camera_looked_and_knows_where_that_was(orbit):
+    field, sdf = orbit.field(), furnished_room()
+    seen = visible_points(furnished_orbit(16), 200)
+    error = field.distance(seen) - sdf(seen)
+    sure = field.confidence(seen) > 0.95
+    assert sure.float().mean() > 0.1
+    assert error[sure].abs().mean() < 0.04
+    assert error[sure].abs().mean() < 0.7 * error[~sure].abs().mean()
+    assert error.abs().mean() < 0.06
+    assert (error > 0.05).float().mean() < 0.06
+    everywhere = torch.cat([seen, room_points()])
+    everywhere = everywhere[sdf(everywhere) > 0]
+    assert roc_area(field.confidence(everywhere), field.distance(everywhere) - sdf(everywhere)) > 0.85
+    assert field.confidence(seen).mean() > 0.6
+    assert field.confidence(torch.tensor([[0.0, 0.0, 30.0]])) == 0
+
+
+def test_guesses_beat_the_distance_to_what_was_seen():
+    mapper, sdf = Mapper(), furnished_room()
+    for frame in furnished_orbit(16)[:2]:
+        mapper.integrate(frame)
+    seeds, _, _ = surface_seeds(mapper.bricks.arrays, *mapper.bricks.box(np.full(3, -9.0), np.full(3, 9.0)))
+    points = room_points()
+    points = points[sdf(points) > 0]
+    upper = torch.from_numpy(cKDTree(seeds).query(points.numpy())[0]).float()
+    field = mapper.field()
+    assert (field.distance(points) - sdf(points)).abs().mean() < 0.5 * (upper - sdf(points)).abs().mean()
+
+
+def test_truth_lies_between_the_bounds(orbit):
+    lattice, bricks = orbit.lattice, orbit.bricks
+    seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(np.full(3, -9.0), np.full(3, 9.0)))
+    proven = gather(seeds, lattice.evidence, lattice.corner, lattice.spacing)
+    nodes = lattice.spacing * (lattice.corner + np.argwhere(np.ones(lattice.shape, dtype=bool)))
+    inside = (np.abs(nodes) < [2.5, 2.0, 9]).all(axis=1) & (nodes[:, 2] > 0) & (nodes[:, 2] < 2.5)
+    truth = furnished_room()(torch.from_numpy(nodes)).numpy()[inside]
+    assert (truth > proven.upper.ravel()[inside] + 0.05).mean() < 0.01
+    free = proven.free.ravel()[inside]
+    assert free.any()
+    assert (truth[free] < proven.lower.ravel()[inside][free] - 0.08).mean() < 0.02
+
+
+def test_sweeps_find_the_nearest_points():
+    points = (np.random.default_rng(0).random((300, 3)) * [20, 16, 12]).astype(np.float32)
+    _, square = nearest_points(points, (20, 16, 12), 1)
+    nodes = np.argwhere(np.ones((20, 16, 12), dtype=bool))
+    exact = cKDTree(points).query(nodes)[0]
+    assert (np.sqrt(square).ravel() >= exact - 1e-4).all()
+    assert (np.sqrt(square).ravel() - exact).mean() < 0.01
+
+
+def test_gradient_is_that_of_the_interpolant(orbit):
+    field = orbit.field()
+    points = room_points(40).double()
+    spacing = 0.25 * field.spacing
+    points = (torch.floor(points / spacing) + 0.5) * spacing  # away from where pieces meet
+    assert_gradient_matches(
+        lambda p: field.distance(p).sum(),
+        lambda p: field.distance_and_gradient(p)[1],
+        points, step=2e-3, rtol=0.02, atol=0.02,
+    )  # fmt: skip
+    points.requires_grad_(True)
+    field.distance(points).sum().backward()
+    torch.testing.assert_close(points.grad, field.distance_and_gradient(points.detach())[1])
+
+
+def test_queries_of_any_shape_and_number_of_threads_agree(orbit):
+    field, points = orbit.field(), room_points(40_000)
+    distance, gradient = field.distance_and_gradient(points.view(200, 200, 3))
+    assert distance.shape == (200, 200) and gradient.shape == (200, 200, 3)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        torch.testing.assert_close(field.distance(points), distance.view(-1))
+    finally:
+        torch.set_num_threads(before)
+    assert field.distance(torch.zeros(0, 3)).shape == (0,)
+    assert field.distance(torch.tensor([[torch.nan, 0, 0]])).isnan().all()
+    assert torch.isfinite(field.distance(torch.tensor([[1e6, -1e6, 1e6]]))).all()
+
+
+def test_a_baked_field_is_close_to_the_field(orbit):
+    field, points = orbit.field(), visible_points(furnished_orbit(16), 50)
+    baked = field.bake(0.04)
+    assert (baked.distance(points) - field.distance(points)).abs().mean() < 0.005
+
+
+def test_snapshots_do_not_change_and_saved_maps_go_on_alike(tmp_path):
+    frames = furnished_orbit(16)
+    mapper = Mapper()
+    for frame in frames[:6]:
+        mapper.integrate(frame)
+    mapper.save(tmp_path / "map.safetensors")
+    snapshot, points = mapper.field(), room_points()
+    before = snapshot.distance(points)
+    again = load_map(tmp_path / "map.safetensors")
+    assert isinstance(again, Mapper)
+    torch.testing.assert_close(again.field().distance(points), before)
+    for frame in frames[6:9]:
+        mapper.integrate(frame)
+        again.integrate(frame)
+    assert torch.equal(snapshot.distance(points), before)
+    assert not torch.equal(mapper.field().distance(points), before)
+    difference = (again.field().distance(points) - mapper.field().distance(points)).abs()
+    assert difference.mean() < 1e-3  # fused distances are saved in half precision
+
+
+def test_damaged_files_are_refused(tmp_path, orbit):
+    path = tmp_path / "map.safetensors"
+    orbit.save(path)
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(CheckpointError, match="map"):
+        Mapper.load(path)
+
+
+def scene(*extra):
+    return union(furnished_room(), *extra)
+
+
+def watch(mapper, sdf, start, seconds, fps=10):
+    """Look at the middle of the room for a while."""
+    for n in range(round(seconds * fps)):
+        eye = (-1.6 + 0.02 * (n % 3), -1.5, 1.3)
+        frame = render(sdf, look_at(eye, (0.3, 0.2, 0.5)), CAMERA, start + n / fps)
+        mapper.integrate(frame)
+    return start + seconds
+
+
+def test_what_moves_goes_and_comes_within_two_seconds_of_being_looked_at():
+    obstacle, other = box((0.2, -0.7, 0.3), (0.4, 0.4, 0.6)), box((-0.2, 0.6, 0.35), (0.4, 0.4, 0.7))
+    mapper = Mapper()
+    now = watch(mapper, scene(obstacle), 0.0, 2.0)
+    near = torch.tensor([0.08, -0.82, 0.5]) + 0.16 * (
+        torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    )
+    assert (mapper.field().distance(near) - scene(obstacle)(near)).abs().mean() < 0.05
+    frame = render(scene(other), look_at((-1.6, -1.5, 1.3), (0.3, 0.2, 0.5)), CAMERA)
+    rest = visible_points([frame], 2000)
+    rest = rest[(scene(obstacle)(rest) - scene(other)(rest)).abs() < 1e-3]
+    before = (mapper.field().distance(rest) - scene(obstacle)(rest)).abs().mean()
+    now = watch(mapper, scene(other), now, 2.0)
+    field, truth = mapper.field(), scene(other)
+    gone = (field.distance(near) - truth(near)).abs()
+    assert gone.mean() < 0.08
+    front = torch.tensor([-0.3, 0.5, 0.5]) + 0.1 * (
+        torch.rand(200, 3, generator=torch.Generator().manual_seed(1)) - 0.5
+    )
+    assert (field.distance(front) < 0).float().mean() > 0.8
+    assert (field.distance(rest) - truth(rest)).abs().mean() < 1.1 * before + 0.002
+
+
+def test_a_jump_of_the_pose_is_passed_over_and_said_so(caplog):
+    mapper, sdf = Mapper(), furnished_room()
+    now = watch(mapper, sdf, 0.0, 1.0)
+    points = room_points()
+    mapper.refresh()
+    before = mapper.field().distance(points)
+    frame = render(sdf, look_at((-1.63, -1.5, 1.3), (0.3, 0.2, 0.5)), CAMERA, now)
+    T = frame.T_world_camera.clone()
+    T[:3, 3] += torch.tensor([0.1, 0.1, 0.27])
+    with caplog.at_level(logging.WARNING):
+        mapper.integrate(DepthFrame(frame.depth, T, CAMERA, now))
+    assert "contradict" in caplog.text and mapper.frames_skipped == 1
+    mapper.refresh()
+    assert torch.equal(mapper.field().distance(points), before)
+    mapper.integrate(DepthFrame(frame.depth + 1e-3, frame.T_world_camera, CAMERA, now))
+    assert mapper.frames_seen == 11
+    for n in range(8):  # but a jump that lasts is believed
+        mapper.integrate(DepthFrame(frame.depth + 1e-4 * (n + 1), T, CAMERA, now + 0.1 * n))
+    assert mapper.frames_skipped < 8
+
+
+def test_a_hanging_camera_does_no_harm_and_is_said_so(caplog):
+    mapper, sdf = Mapper(), furnished_room()
+    watch(mapper, sdf, 0.0, 0.5)
+    frame = render(sdf, look_at((-1.6, -1.5, 1.3), (0.3, 0.2, 0.5)), CAMERA, 0.6)
+    with caplog.at_level(logging.WARNING):
+        for n in range(5):
+            mapper.integrate(replace_time(frame, 0.6 + 0.1 * n))
+        mapper.integrate(furnished_orbit(16)[0])
+    assert caplog.text.count("hangs") == 1 and "is back" in caplog.text
+    assert mapper.frames_skipped == 4
+    assert torch.isfinite(mapper.field().distance(room_points())).all()
+
+
+def replace_time(frame, time):
+    return DepthFrame(frame.depth, frame.T_world_camera, frame.camera, time)
+
+
+def test_bad_input_is_refused_by_name():
+    with pytest.raises(NotReadyError, match="integrate"):
+        Mapper().field()
+    with pytest.raises(NotReadyError, match="integrate"):
+        _ = Mapper().bounds
+    with pytest.raises(ConfigError, match="voxel"):
+        MapperConfig(voxel=-1.0)
+    with pytest.raises(ConfigError, match="truncation"):
+        replace(MapperConfig(), truncation=0.05)
+    far = DepthFrame(torch.full((60, 80), 20.0), torch.eye(4), CAMERA)
+    with pytest.raises(FrameError, match="max_depth"):
+        Mapper().integrate(far)
+
+
+def test_the_network_can_only_share_out_the_gap():
+    share, width = load_network()(torch.randn(1, CHANNELS, 16, 16, 8))
+    assert share.shape == width.shape == (1, 16, 16, 8)
+    assert bool(((share >= 0) & (share <= 1)).all()) and torch.isfinite(width).all()
+
+
+def test_turned_worlds_give_the_same_map():
+    sdf, points = furnished_room(), room_points(2000)
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # y up becomes -z down
+    fields = []
+    for R in (torch.eye(3), turn):
+        mapper = Mapper()
+        for frame in furnished_orbit(16)[:4]:
+            T = frame.T_world_camera.clone()
+            T[:3] = R.double() @ T[:3]
+            mapper.integrate(DepthFrame(frame.depth, T, frame.camera, frame.time))
+        mapper.refresh()
+        fields.append(mapper.field().distance(points @ R.T))
+    assert (fields[0] - fields[1]).abs().mean() < 0.06
+    assert sdf(points).abs().mean() > 0.2
+
+
+def test_the_command_line_maps_with_it_by_default(tmp_path, monkeypatch):
+    frames = furnished_orbit(16)
+    writer = SequenceWriter(tmp_path / "seq", frames[0].camera, fps=10.0)
+    for frame in frames[:8]:
+        writer.write(frame.depth.numpy(), frame.T_world_camera.numpy())
+    monkeypatch.setattr("sys.argv", ["isdf", "map", str(tmp_path / "seq"), "--out", str(tmp_path / "run")])
+    main()
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["method"] == "default" and report["frames_used"] >= 1
+    np.save(tmp_path / "points.npy", room_points(100).numpy())
+    monkeypatch.setattr(
+        "sys.argv",
+        ["isdf", "query", str(tmp_path / "run"),
+         "--points", str(tmp_path / "points.npy"), "--out", str(tmp_path / "a.npz")],
+    )  # fmt: skip
+    main()
+    answer = np.load(tmp_path / "a.npz")
+    assert set(answer.files) == {"distance", "gradient", "confidence"}
+    assert (
+        np.isfinite(answer["distance"]).all()
+        and ((answer["confidence"] >= 0) & (answer["confidence"] <= 1)).all()
+    )
