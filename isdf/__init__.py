@@ -1,8 +1,10 @@
 """Neural signed distance fields learned online from posed depth images (iSDF; Ortiz et al., RSS 2022)."""
 
+from .background import BackgroundMapper, Rates, Snapshot
 from .camera import PinholeCamera
 from .cost import CostField
 from .errors import (
+    BackgroundError,
     CameraError,
     CheckpointError,
     ConfigError,
@@ -22,6 +24,8 @@ from .network import NetworkConfig
 from .sampling import SamplingConfig
 
 __all__ = [
+    "BackgroundError",
+    "BackgroundMapper",
     "CameraError",
     "CheckpointError",
     "ConfigError",
@@ -42,7 +46,9 @@ __all__ = [
     "NeuralField",
     "NotReadyError",
     "PinholeCamera",
+    "Rates",
     "SamplingConfig",
+    "Snapshot",
     "bake",
     "load_map",
     "query",

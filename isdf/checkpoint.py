@@ -1,23 +1,20 @@
-"""Maps as files: safetensors for the numbers, a JSON header for the rest, one atomic write, no pickle."""
+"""The state of `isdf.Mapper` as a map file: network, optimiser, random draws and keyframes."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
-import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save as to_bytes
 
 from .camera import PinholeCamera
-from .errors import CheckpointError, IsdfError
+from .errors import CheckpointError
 from .frames import DepthFrame
 from .keyframes import KeyframeConfig
 from .losses import LossConfig
+from .mapfile import consistent, read, require_finite, write
 from .network import NetworkConfig, SDFNetwork
 from .sampling import SamplingConfig
 
@@ -28,87 +25,31 @@ FORMAT = "isdf-map"
 VERSION = 1
 
 
-def save(mapper: IsdfMapper, path: Path) -> None:
+def save(mapper: IsdfMapper, path: Path, note: Mapping[str, Any]) -> None:
     """Write the whole state of a mapper; an existing file is replaced only by a complete new one.
+
+    Args:
+        mapper: what to save.
+        path: the file.
+        note: further entries of the header, such as where the frames came from.
 
     Raises:
         NotReadyError: no frame has been integrated yet.
         OSError: the folder cannot be written.
     """
-    write(path, *_state(mapper))
+    tensors, header = _state(mapper)
+    write(path, tensors, {**note, **header})
 
 
 def load(path: Path, device: str | torch.device = "cpu") -> IsdfMapper:
     """Read a map written by `save`.
 
     Raises:
-        CheckpointError: the file is missing, damaged, of another kind or of a newer version.
+        CheckpointError: the file is missing, damaged, inconsistent, of another kind or of a newer version.
     """
     tensors, header = read(path, FORMAT, VERSION)
-    try:
+    with consistent(path):
         return _restore(tensors, header, device)
-    except (KeyError, TypeError, IndexError, RuntimeError, AttributeError, IsdfError) as error:
-        raise CheckpointError(
-            f"{path}: the map is incomplete or inconsistent ({error}); map again"
-        ) from error
-
-
-def write(path: Path, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
-    """Write tensors and a JSON header to one file; an existing file is replaced only by a complete new one."""
-    data = to_bytes(tensors, metadata={"isdf": json.dumps(header)})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def kind(path: Path) -> str:
-    """The `format` that the header of a map file names.
-
-    Raises:
-        CheckpointError: the file is missing, damaged or no map.
-    """
-    if not path.is_file():
-        raise CheckpointError(
-            f"{path}: no such file; a map is written by mapper.save(path) or `isdf map --out`"
-        )
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("isdf", "null"))
-    except (SafetensorError, json.JSONDecodeError, OSError) as error:
-        raise CheckpointError(f"{path}: not a readable map ({error})") from error
-    if not isinstance(header, dict) or not isinstance(header.get("format"), str):
-        raise CheckpointError(f"{path}: a safetensors file, but not a map written by this package")
-    return header["format"]
-
-
-def read(path: Path, expected: str, version: int) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Tensors and header of a map file of the expected format and version.
-
-    Raises:
-        CheckpointError: the file is missing, damaged, of another kind or of another version.
-    """
-    found = kind(path)
-    if found != expected:
-        raise CheckpointError(
-            f"{path}: a map of format {found!r}, not {expected!r}; isdf.load_map(path) reads every kind"
-        )
-    with safe_open(str(path), framework="pt") as file:
-        header = json.loads(file.metadata()["isdf"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    if header.get("version") != version:
-        raise CheckpointError(
-            f"{path}: map format version {header.get('version')}, this release reads {version}; "
-            "update the package or map again"
-        )
-    return tensors, header
 
 
 def _state(mapper: IsdfMapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -133,8 +74,6 @@ def _state(mapper: IsdfMapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]
     header = {
         "format": FORMAT,
         "version": VERSION,
-        "units": "metres",
-        "frame": "world",
         "config": dataclasses.asdict(mapper.config),
         "frames_seen": mapper.frames_seen,
         "steps": mapper.steps,
@@ -143,7 +82,7 @@ def _state(mapper: IsdfMapper) -> tuple[dict[str, torch.Tensor], dict[str, Any]]
         "newest": next(i for i, f in enumerate(frames) if f is newest),
         "newest_judged": mapper._newest_judged,
     }
-    return {name: value.detach().cpu().contiguous() for name, value in tensors.items()}, header
+    return tensors, header
 
 
 def _restore(
@@ -151,10 +90,13 @@ def _restore(
 ) -> IsdfMapper:
     from .isdf_mapper import IsdfMapper, new_optimiser
 
-    mapper = IsdfMapper(_config(header["config"]), device)
+    config = _config(header["config"])
+    _check_size(config.network, tensors)
+    require_finite(tensors)
+    mapper = IsdfMapper(config, device)
     mapper.frames_seen, mapper.steps = int(header["frames_seen"]), int(header["steps"])
     mapper.generator.set_state(tensors["generator"])
-    mapper._bounds = tensors["bounds"]
+    mapper._bounds = tensors["bounds"].reshape(2, 3)
     mapper._network = _network(tensors, "network", mapper.config.network).to(mapper.device)
     mapper._frozen = _network(tensors, "frozen", mapper.config.network).to(mapper.device)
     mapper._optimiser = new_optimiser(mapper._network, mapper.config)
@@ -163,6 +105,7 @@ def _restore(
         if name.startswith("optimiser."):
             _, index, key = name.split(".")
             moments.setdefault(int(index), {})[key] = value
+    _check_moments(moments, list(mapper._network.parameters()))
     groups = mapper._optimiser.state_dict()["param_groups"]
     mapper._optimiser.load_state_dict({"state": moments, "param_groups": groups})
     frames = [
@@ -179,6 +122,22 @@ def _restore(
     mapper._newest = frames[header["newest"]]
     mapper._newest_judged = bool(header["newest_judged"])
     return mapper
+
+
+def _check_size(config: NetworkConfig, tensors: dict[str, torch.Tensor]) -> None:
+    """Refuse a configured network that is larger than the stored one, before memory is taken for it."""
+    stored = sum(value.numel() for name, value in tensors.items() if name.startswith("network."))
+    claimed = config.width * (config.width * (config.hidden_layers - 1) + config.frequency_octaves)
+    if claimed > stored:
+        raise CheckpointError(f"its network should have over {claimed:.3g} numbers and has {stored}")
+
+
+def _check_moments(moments: dict[int, dict[str, torch.Tensor]], parameters: list[torch.nn.Parameter]) -> None:
+    """Refuse optimiser state that does not fit the parameters, which would fail only at the next step."""
+    for index, values in moments.items():
+        for name in ("exp_avg", "exp_avg_sq"):
+            if values[name].shape != parameters[index].shape:
+                raise CheckpointError(f"optimiser.{index}.{name} has shape {tuple(values[name].shape)}")
 
 
 def _network(tensors: dict[str, torch.Tensor], prefix: str, config: NetworkConfig) -> SDFNetwork:

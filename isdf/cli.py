@@ -1,30 +1,35 @@
-"""The `isdf` command: map a recorded sequence, query a map."""
+"""The `isdf` command, and its longest part: mapping a recorded sequence."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import logging
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
 import torch
 import tyro
 from tqdm import tqdm
 
+from .atomic import sweep
+from .checkpointing import Checkpointer, Stopped, take_up
+from .commands import MAP_FILE, Export, Info, Outcome, Query
 from .datasets import DepthSequence, open_sequence
-from .errors import ConfigError, IsdfError
-from .field import query
-from .isdf_mapper import IsdfConfig, IsdfMapper
+from .errors import CheckpointError, ConfigError, IsdfError
+from .isdf_mapper import IsdfConfig
 from .mapping import MapperConfig
-from .methods import Config, OnlineMapper, VoxelConfig, load_map
-from .runner import RunReport, Watch, run_at_rate, run_at_steps, run_every_frame
+from .methods import Config, OnlineMapper, VoxelConfig
+from .results import write_results
+from .runner import Begun, RunReport, Watch, run_at_rate, run_at_steps, run_every_frame
 from .voxel import ExactConfig, FiestaConfig, KinectFusionConfig, VoxbloxConfig
 
-MAP_FILE = "map.safetensors"
+logger = logging.getLogger(__name__)
+
 VOXEL_METHODS: dict[str, type[VoxelConfig]] = {
     "exact": ExactConfig,
     "voxblox": VoxbloxConfig,
@@ -42,10 +47,16 @@ class Map:
     --steps-per-second K is live on a machine that makes K steps a second, whatever this one makes.
     """
 
-    sequence_dir: tyro.conf.Positional[Path]
+    sequence_dir: tyro.conf.Positional[Path | None] = None
     """Recorded folder, ReplicaCAD, Replica, ScanNet, 7-Scenes or TUM RGB-D sequence, or a ROS bag."""
-    out: Path
+    out: Path | None = None
     """Folder for the results; made if missing."""
+    resume: Path | None = None
+    """Go on with a run that was stopped or killed, from the checkpoint in its --out folder. All other options but
+    --json are those it was started with."""
+    checkpoint_every: float = 10.0
+    """Seconds of wall time between two checkpoints of the map; killed at any moment, a run has lost no more than
+    that. Saving does not count against the clock."""
     steps_per_frame: int | None = None
     """Optimisation steps on every frame."""
     steps_per_second: float | None = None
@@ -75,33 +86,76 @@ class Map:
     """Seed of all random draws."""
     threads: int = 1
     """Threads of the matrix library; more than one shortens the wall time but costs CPU time."""
+    json: bool = False
+    """Print the outcome as one line of JSON."""
 
-    def run(self) -> None:
+    def run(self) -> Outcome:
         """Map, then write the results."""
-        clocks = (self.steps_per_frame, self.steps_per_second, self.cpu_per_second)
-        if sum(clock is not None for clock in clocks) > 1:
-            raise ConfigError("give one of --steps-per-frame, --steps-per-second and --cpu-per-second")
+        if self.resume is None:
+            return self._map(Begun(RunReport()))
+        if self != Map(resume=self.resume, json=self.json):
+            raise ConfigError(
+                "--resume goes on as the run was started; leave all other options but --json out"
+            )
+        begun, options = take_up(self.resume / MAP_FILE)
+        return _restored(options, self.resume)._map(begun)
+
+    def _map(self, begun: Begun) -> Outcome:
+        if self.sequence_dir is None or self.out is None:
+            raise ConfigError("give a sequence and --out FOLDER, or --resume FOLDER")
+        self._check()
         torch.set_num_threads(max(1, self.threads))
-        sequence = open_sequence(self.sequence_dir, self.fps)
+        sequence, path = open_sequence(self.sequence_dir, self.fps), self.out / MAP_FILE
+        sweep(path)
         with tqdm(total=len(sequence), unit="frame", desc="mapping", disable=None) as bar:
 
             def progress(_: OnlineMapper, arrived: int) -> None:
                 bar.update(arrived - bar.n)
 
-            mapper, report = self._run(sequence, self._config(), progress)
-        self._write(mapper, report, sequence)
+            with Checkpointer(path, self.checkpoint_every, begun.report, self._options(), progress) as watch:
+                try:
+                    mapper, report = self._run(sequence, self._config(), watch, begun)
+                except Stopped as stopped:
+                    if stopped.saved:
+                        logger.warning("go on with: isdf map --resume %s", self.out)
+                    raise
+        watch.save(mapper, finished=True)
+        return write_results(mapper, report, sequence, self.out, self)
 
-    def _run(self, sequence: DepthSequence, config: Config, watch: Watch) -> tuple[OnlineMapper, RunReport]:
+    def _check(self) -> None:
+        """Refuse what would fail only after an hour of mapping."""
+        clocks = (self.steps_per_frame, self.steps_per_second, self.cpu_per_second)
+        if sum(clock is not None for clock in clocks) > 1:
+            raise ConfigError("give one of --steps-per-frame, --steps-per-second and --cpu-per-second")
+        if not self.mesh_spacing > 0 or not self.checkpoint_every > 0:
+            raise ConfigError(
+                "--mesh-spacing and --checkpoint-every must be positive, got "
+                f"{self.mesh_spacing} and {self.checkpoint_every}"
+            )
+        if self.up is not None and not 0 < np.linalg.norm(self.up) < np.inf:
+            raise ConfigError(f"--up must be a direction, got {self.up}")
+
+    def _options(self) -> dict[str, Any]:
+        """What it takes to start this run again, but for the folder it is in."""
+        assert self.sequence_dir is not None
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        values["sequence_dir"] = str(self.sequence_dir.resolve())
+        given = {f.name for f in dataclasses.fields(self) if values[f.name] != f.default}
+        return {name: values[name] for name in sorted(given - {"out", "resume", "json"})}
+
+    def _run(
+        self, sequence: DepthSequence, config: Config, watch: Watch, begun: Begun
+    ) -> tuple[OnlineMapper, RunReport]:
         if self.steps_per_frame is not None:
-            return run_every_frame(sequence, config, self.steps_per_frame, watch)
+            return run_every_frame(sequence, config, self.steps_per_frame, watch, begun)
         if self.steps_per_second is not None:
             if not isinstance(config, IsdfConfig):
                 raise ConfigError(
                     f"--steps-per-second belongs to --method isdf; {self.method} makes no steps"
                 )
-            return run_at_steps(sequence, config, self.steps_per_second, watch)
+            return run_at_steps(sequence, config, self.steps_per_second, watch, begun)
         rate = 1.0 if self.cpu_per_second is None else self.cpu_per_second
-        return run_at_rate(sequence, config, rate, watch)
+        return run_at_rate(sequence, config, rate, watch, begun)
 
     def _config(self) -> Config:
         if self.method != "isdf":
@@ -120,79 +174,57 @@ class Map:
         presets = {"cpu": IsdfConfig(), "paper": IsdfConfig.paper(), "released": IsdfConfig.released()}
         return dataclasses.replace(presets[self.preset], seed=self.seed, bound=self.bound)
 
-    def _write(self, mapper: OnlineMapper, report: RunReport, sequence: DepthSequence) -> None:
-        from .meshing import zero_level_mesh
-        from .slices import estimate_up, save_slices, slice_heights
 
-        self.out.mkdir(parents=True, exist_ok=True)
-        mapper.save(self.out / MAP_FILE)
-        field = mapper.field()
-        poses = sequence.poses[np.isfinite(sequence.poses).all(axis=(1, 2))]
-        up = estimate_up(poses) if self.up is None else np.array(self.up) / np.linalg.norm(self.up)
-        mesh = zero_level_mesh(field, self.mesh_spacing, up=up)
-        mesh.export(self.out / "mesh.ply")
-        heights = list(self.slice_heights) or slice_heights(field, up)
-        frames = mapper.keyframes.frames if isinstance(mapper, IsdfMapper) else []
-        keyframes = np.array([f.T_world_camera[:3, 3].numpy() for f in frames]).reshape(-1, 3)
-        save_slices(self.out / "slices.png", field, heights, up, poses, keyframes)
-        summary = dataclasses.asdict(report) | {
-            "sequence": self.sequence_dir.name,
-            "clock": {
-                "steps_per_frame": self.steps_per_frame,
-                "steps_per_second": self.steps_per_second,
-                "cpu_per_second": self.cpu_per_second,
-            },
-            "method": self.method,
-            "preset": self.preset,
-            "config": dataclasses.asdict(mapper.config),
-            "bounds": mapper.bounds.tolist(),
-            "up": up.tolist(),
-            "slice_heights": heights,
-            "mesh_vertices": len(mesh.vertices),
-            "mesh_faces": len(mesh.faces),
-        }
-        (self.out / "report.json").write_text(json.dumps(summary, indent=1) + "\n")
-        print(
-            f"{report.frames_used} of {report.frames} frames, {report.keyframes} keyframes, {report.steps} steps in "
-            f"{report.cpu_seconds:.1f} CPU s; {self.out}: {MAP_FILE}, mesh.ply ({len(mesh.faces)} faces), slices.png, "
-            "report.json"
-        )
+def _restored(options: dict[str, Any], out: Path) -> Map:
+    """The command that a run was started with, checked as if it were typed again."""
+    words = ["--out", str(out)]
+    for name, value in options.items():
+        values = value if isinstance(value, list) else [value]
+        option = [] if name == "sequence_dir" else [f"--{name.replace('_', '-')}"]
+        words += [*option, *(str(v) for v in values)]
+    try:
+        return tyro.cli(Map, args=words, console_outputs=False)
+    except SystemExit:
+        raise CheckpointError(
+            f"{out / MAP_FILE}: its run has impossible options: {' '.join(words)}"
+        ) from None
 
 
-@dataclass(frozen=True)
-class Query:
-    """Distances and gradients of a saved map at any world points."""
+Command = (
+    Annotated[Map, tyro.conf.subcommand("map")]
+    | Annotated[Query, tyro.conf.subcommand("query")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+)
 
-    run_dir: tyro.conf.Positional[Path]
-    """Folder that `isdf map` wrote, or a map file."""
-    points: Path
-    """A .npy file with an (N, 3) array of world points [m]."""
-    out: Path
-    """The .npz file to write: distance (N,) [m], gradient (N, 3), and confidence (N,) where the field has one."""
+DESCRIPTION = """Signed distance fields from posed depth images: map a recording; query, export or describe the map.
 
-    def run(self) -> None:
-        """Load, query, write."""
-        path = self.run_dir / MAP_FILE if self.run_dir.is_dir() else self.run_dir
-        field = load_map(path).field()
-        try:
-            points = np.load(self.points, allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise IsdfError(f"{self.points}: not a readable .npy array ({error})") from error
-        answers = query(field, points)
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(self.out, **answers)  # type: ignore[arg-type]
-        print(f"{len(points)} points: {', '.join(answers)} in {self.out}")
-
-
-Command = Annotated[Map, tyro.conf.subcommand("map")] | Annotated[Query, tyro.conf.subcommand("query")]
+Exit codes: 0 done; 1 a file could not be read or written, or a bug; 2 bad input or unknown options; 130 stopped by
+Ctrl-C and 143 by SIGTERM (isdf map leaves a checkpoint then: isdf map --resume FOLDER). With --json the outcome is one
+line of JSON on standard output, and so is an error on standard error."""
 
 
 def main() -> None:
-    """Entry point of the `isdf` command; exit code 2 on bad input, with one line that says what was wrong."""
+    """Entry point of the `isdf` command; what goes wrong is said in one line, see `DESCRIPTION` for exit codes."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    command = tyro.cli(Command, prog="isdf", description="Neural signed distance fields from depth images.")  # type: ignore[arg-type]
+    as_json = "--json" in sys.argv
     try:
-        command.run()
+        command = tyro.cli(Command, prog="isdf", description=DESCRIPTION)  # type: ignore[arg-type]
+        outcome = command.run()
+        print(json.dumps(outcome.data) if as_json else outcome.text, flush=True)
     except IsdfError as error:
-        print(f"isdf: {error}", file=sys.stderr)
-        sys.exit(2)
+        _fail(2, type(error).__name__, str(error), as_json)
+    except BrokenPipeError:  # the reader of our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        _fail(1, type(error).__name__, str(error), as_json)
+    except Stopped as stopped:
+        _fail(128 + stopped.number, "Stopped", str(stopped), as_json)
+    except KeyboardInterrupt:
+        _fail(130, "Stopped", "stopped by SIGINT", as_json)
+
+
+def _fail(code: int, kind: str, message: str, as_json: bool) -> NoReturn:
+    line = json.dumps({"error": kind, "message": message}) if as_json else f"isdf: {message}"
+    print(line, file=sys.stderr)
+    sys.exit(code)

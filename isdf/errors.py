@@ -31,5 +31,9 @@ class NotReadyError(IsdfError):
     """The map was asked for something it can only give after a first frame."""
 
 
+class BackgroundError(IsdfError):
+    """The background mapper has failed, by the error this one was raised from, or is closed."""
+
+
 class EvaluationError(IsdfError):
     """A map cannot be judged: its answers are not numbers, or there is nothing to judge it by."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
@@ -217,11 +218,11 @@ class IsdfMapper:
         """The CHOMP collision cost c(f(x)) with reach `eps` [m], over a snapshot of the field."""
         return CostField(self.field(), eps)
 
-    def save(self, path: str | Path) -> None:
-        """Write everything needed to go on training to one file, atomically."""
+    def save(self, path: str | Path, note: Mapping[str, Any] | None = None) -> None:
+        """Write everything needed to go on training to one file, atomically; `note` goes into its header."""
         from . import checkpoint
 
-        checkpoint.save(self, Path(path))
+        checkpoint.save(self, Path(path), note or {})
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> IsdfMapper:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from . import checkpoint
+import torch
+
+from . import checkpoint, mapfile
 from .errors import CheckpointError, ConfigError
 from .isdf_mapper import IsdfConfig, IsdfMapper
 from .mapping import Mapper, MapperConfig
@@ -18,6 +20,7 @@ from .voxel import (
     KinectFusionMapper,
     VoxbloxConfig,
     VoxbloxMapper,
+    VoxelMapper,
 )
 
 VoxelConfig = ExactConfig | VoxbloxConfig | FiestaConfig | KinectFusionConfig
@@ -55,15 +58,25 @@ def new_mapper(config: Config) -> OnlineMapper:
     return _MAPPERS[type(config)](config)  # type: ignore[arg-type]
 
 
-def load_map(path: str | Path) -> OnlineMapper:
+def load_map(path: str | Path, device: str | torch.device = "cpu") -> OnlineMapper:
     """Read a map file of any method, as its header says.
+
+    Args:
+        path: the file.
+        device: where a network is to live, whatever device it was trained on; voxel maps are on the CPU.
 
     Raises:
         CheckpointError: the file is missing, damaged, of an unknown kind or of another version.
+        ConfigError: a voxel map is wanted on another device.
     """
-    found = checkpoint.kind(Path(path))
+    found = mapfile.kind(Path(path))
     if found not in _FORMATS:
         raise CheckpointError(
             f"{path}: a map of format {found!r}; this release reads {', '.join(_FORMATS)}: update the package"
         )
-    return _FORMATS[found].load(path)
+    method = _FORMATS[found]
+    if not issubclass(method, VoxelMapper):
+        return method.load(path, device)
+    if torch.device(device).type != "cpu":
+        raise ConfigError(f"{path}: a voxel map ({found}) works on the CPU only, not on {device}")
+    return method.load(path)

@@ -20,9 +20,14 @@ Watch = Callable[[OnlineMapper, int], None]
 
 @dataclass
 class RunReport:
-    """What happened while a sequence was mapped. Times in seconds, of this process's CPU clock over all threads."""
+    """What happened while a sequence was mapped. Times in seconds, of this process's CPU clock over all threads.
+
+    It is kept up to date while a run goes on. With it and the mapper a run can be resumed: every clock starts from
+    `frames_arrived`, `cpu_seconds` and `waited_seconds`.
+    """
 
     frames: int = 0
+    frames_arrived: int = 0
     frames_used: int = 0
     frames_dropped: int = 0
     frames_refused: dict[int, str] = field(default_factory=dict)
@@ -31,14 +36,24 @@ class RunReport:
     sequence_seconds: float = 0.0
     cpu_seconds: float = 0.0
     wall_seconds: float = 0.0
+    waited_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A run so far: its report, which the runner keeps up to date, and its mapper, None where there is none yet."""
+
+    report: RunReport
+    mapper: OnlineMapper | None = None
 
 
 class _Stopwatch:
-    """CPU and wall seconds spent on mapping, without what the watcher uses."""
+    """CPU and wall seconds spent on mapping, without what the watcher uses; kept up to date in the report."""
 
-    def __init__(self, watch: Watch) -> None:
-        self._watch = watch
-        self._cpu, self._wall = time.process_time(), time.perf_counter()
+    def __init__(self, watch: Watch, report: RunReport) -> None:
+        self._watch, self._report = watch, report
+        self._cpu = time.process_time() - report.cpu_seconds
+        self._wall = time.perf_counter() - report.wall_seconds
 
     @property
     def cpu(self) -> float:
@@ -50,13 +65,16 @@ class _Stopwatch:
 
     def watch(self, mapper: OnlineMapper, arrived: int) -> None:
         cpu, wall = time.process_time(), time.perf_counter()
+        report = self._report
+        report.cpu_seconds, report.wall_seconds = self.cpu, self.wall
+        report.frames_arrived, report.steps = arrived, mapper.steps
         self._watch(mapper, arrived)
         self._cpu += time.process_time() - cpu
         self._wall += time.perf_counter() - wall
 
 
 def run_every_frame(
-    sequence: DepthSequence, config: Config, steps_per_frame: int, watch: Watch
+    sequence: DepthSequence, config: Config, steps_per_frame: int, watch: Watch, begun: Begun | None = None
 ) -> tuple[OnlineMapper, RunReport]:
     """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take.
 
@@ -68,17 +86,21 @@ def run_every_frame(
         config = replace(
             config, first_frame_steps=steps_per_frame, steps_per_frame=steps_per_frame, keyframe_steps=0
         )
-    mapper, report = new_mapper(config), RunReport()
-    spent = _Stopwatch(watch)
-    for index in range(len(sequence)):
+    mapper, report = _take_up(begun, config)
+    spent = _Stopwatch(watch, report)
+    for index in range(report.frames_arrived, len(sequence)):
         _integrate(mapper, sequence, index, report)
         spent.watch(mapper, index + 1)
     return mapper, _finish(report, mapper, sequence, spent)
 
 
 def run_at_steps(
-    sequence: DepthSequence, config: IsdfConfig, steps_per_second: float, watch: Watch
-) -> tuple[IsdfMapper, RunReport]:
+    sequence: DepthSequence,
+    config: IsdfConfig,
+    steps_per_second: float,
+    watch: Watch,
+    begun: Begun | None = None,
+) -> tuple[OnlineMapper, RunReport]:
     """As on a machine that makes so many steps a second, whatever this one makes (the paper's GPU made about 30).
 
     The sequence's clock advances with the steps: the mapper gets the newest frame, trains on it as long as the
@@ -89,9 +111,9 @@ def run_at_steps(
         raise ConfigError(f"steps_per_second must be positive, got {steps_per_second}")
     if config.steps_per_frame < 1:
         raise ConfigError("the clock stands still with steps_per_frame = 0; give at least 1")
-    mapper, report = IsdfMapper(config), RunReport()
-    spent = _Stopwatch(watch)
-    index = 0
+    mapper, report = _take_up(begun, config)
+    spent = _Stopwatch(watch, report)
+    index = report.frames_arrived
     while index < len(sequence):
         refused = not _integrate(mapper, sequence, index, report)
         arrived = int(mapper.steps / steps_per_second * sequence.fps)
@@ -102,7 +124,7 @@ def run_at_steps(
 
 
 def run_at_rate(
-    sequence: DepthSequence, config: Config, cpu_per_second: float, watch: Watch
+    sequence: DepthSequence, config: Config, cpu_per_second: float, watch: Watch, begun: Begun | None = None
 ) -> tuple[OnlineMapper, RunReport]:
     """Live: at most `cpu_per_second` CPU seconds for each second of sequence.
 
@@ -116,11 +138,11 @@ def run_at_rate(
     if isinstance(config, IsdfConfig):
         live = replace(config, first_frame_steps=0, steps_per_frame=0, keyframe_steps=0)
         frame_steps = config.steps_per_frame
-    mapper, report = new_mapper(live), RunReport()
-    spent = _Stopwatch(watch)
+    mapper, report = _take_up(begun, live)
+    spent = _Stopwatch(watch, report)
     budget = len(sequence) / sequence.fps * cpu_per_second
-    patience, last, waited = frame_steps, -1, 0.0
-    while (used := spent.cpu + waited) < budget:
+    patience, last = frame_steps, report.frames_arrived - 1
+    while (used := spent.cpu + report.waited_seconds) < budget:
         newest = min(int(used / cpu_per_second * sequence.fps), len(sequence) - 1)
         if newest > last and _integrate(mapper, sequence, newest, report):
             patience = frame_steps
@@ -129,17 +151,30 @@ def run_at_rate(
         # Nothing usable yet, or nothing to train: wait for the next frame without burning time.
         if mapper.frames_seen == 0 or not isinstance(mapper, IsdfMapper):
             newest_time = (newest + 1) / sequence.fps * cpu_per_second
-            waited += max(0.0, newest_time - (spent.cpu + waited))
+            report.waited_seconds += max(0.0, newest_time - (spent.cpu + report.waited_seconds))
             continue
         # The paper's rule: a new frame gets its steps before the next one is looked for.
         for _ in range(max(1, patience)):
-            if spent.cpu + waited >= budget:
+            if spent.cpu + report.waited_seconds >= budget:
                 break
             mapper.step()
         patience = 1
     report.frames_dropped = len(sequence) - report.frames_used - len(report.frames_refused)
     spent.watch(mapper, len(sequence))
     return mapper, _finish(report, mapper, sequence, spent)
+
+
+def _take_up(begun: Begun | None, config: Config) -> tuple[OnlineMapper, RunReport]:
+    """The mapper and report of a run that has begun, or new ones.
+
+    Raises:
+        ConfigError: the mapper was made with another configuration.
+    """
+    if begun is None or begun.mapper is None:
+        return new_mapper(config), RunReport() if begun is None else begun.report
+    if begun.mapper.config != config:
+        raise ConfigError(f"the run began with {begun.mapper.config}, it cannot go on with {config}")
+    return begun.mapper, begun.report
 
 
 def _integrate(mapper: OnlineMapper, sequence: DepthSequence, index: int, report: RunReport) -> bool:

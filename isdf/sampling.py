@@ -12,6 +12,9 @@ from torch import Tensor
 from .errors import ConfigError
 from .frames import DepthFrame
 
+# Most samples a frame: a step on five such frames takes several gigabytes.
+MAX_SAMPLES = 1 << 20
+
 
 @dataclass(frozen=True)
 class SamplingConfig:
@@ -45,6 +48,11 @@ class SamplingConfig:
             raise ConfigError(
                 "sampling needs rays_per_frame >= 1, stratified >= 1, near_surface >= 0 and extra_surface >= 0, got "
                 f"{self.rays_per_frame}, {self.stratified}, {self.near_surface}, {self.extra_surface}"
+            )
+        samples = self.rays_per_frame * (self.stratified + self.near_surface + 1) + self.extra_surface
+        if samples > MAX_SAMPLES:
+            raise ConfigError(
+                f"{samples} samples a frame do not fit a step, at most {MAX_SAMPLES} do; draw fewer rays"
             )
         if not 0 <= self.min_depth < self.max_depth:
             raise ConfigError(

@@ -15,6 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from .slice_geometry import corners, slice_basis
+
 # Of the same order as the distance at which planners stop caring; farther away all blues look the same.
 COLOUR_LIMIT = 1.5
 
@@ -31,15 +33,6 @@ def estimate_up(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3"]:
     if abs(up[axis]) > np.cos(np.radians(25)):
         up = np.sign(up[axis]) * np.eye(3)[axis]
     return up
-
-
-def slice_basis(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rows: two horizontal directions and up, right-handed; the world's own axes when up is z."""
-    up = up / np.linalg.norm(up)
-    first = np.eye(3)[int(np.abs(up).argmin())]
-    first = first - up * (first @ up)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(up, first), up])
 
 
 def draw_slice(
@@ -67,8 +60,8 @@ def draw_slice(
         grey_unknown: draw grey where the field's `confidence`, if it has one, is below one half.
     """
     basis = slice_basis(up)
-    corners = _corners((field.bounds if bounds is None else bounds).cpu().numpy()) @ basis.T
-    (x0, y0, _), (x1, y1, _) = corners.min(axis=0) - 0.2, corners.max(axis=0) + 0.2
+    box = corners((field.bounds if bounds is None else bounds).cpu().numpy()) @ basis.T
+    (x0, y0, _), (x1, y1, _) = box.min(axis=0) - 0.2, box.max(axis=0) + 0.2
     xs, ys = np.arange(x0, x1, spacing), np.arange(y0, y1, spacing)
     grid = (
         np.stack([*np.meshgrid(xs, ys, indexing="xy"), np.full((len(ys), len(xs)), height)], axis=-1) @ basis
@@ -107,7 +100,7 @@ def save_slices(
     keyframes: Float[np.ndarray, "k 3"] | None = None,
 ) -> None:
     """One picture with a slice for every height, zero level in black, camera path in red, keyframes in green."""
-    across = np.ptp(_corners(field.bounds.cpu().numpy()) @ slice_basis(up).T, axis=0)
+    across = np.ptp(corners(field.bounds.cpu().numpy()) @ slice_basis(up).T, axis=0)
     figure = Figure(figsize=(5 * len(heights) + 1, 5 * across[1] / across[0] + 0.9), layout="constrained")
     axes = figure.subplots(1, len(heights), squeeze=False)[0]
     for ax, height in zip(axes, heights, strict=True):
@@ -119,11 +112,5 @@ def save_slices(
 
 def slice_heights(field: Any, up: Float[np.ndarray, "3"], count: int = 3) -> list[float]:
     """Heights [m] that divide the observed height range evenly, its ends left out."""
-    along = _corners(field.bounds.cpu().numpy()) @ up
+    along = corners(field.bounds.cpu().numpy()) @ up
     return [float(h) for h in np.linspace(along.min(), along.max(), count + 2)[1:-1]]
-
-
-def _corners(bounds: np.ndarray) -> np.ndarray:
-    return np.array(
-        [[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    )

@@ -131,6 +131,54 @@ def test_importing_a_package_loads_nothing_optional(package: str, unwanted: set[
     assert not (found := loaded & unwanted), f"import {package} loads {sorted(found)}"
 
 
+MEASURE = """
+import time, torch
+start = time.process_time()
+import isdf
+print(time.process_time() - start)
+import sys
+from numba.core.dispatcher import Dispatcher
+modules = [m for name, m in sys.modules.items() if name.partition(".")[0] == "isdf"]
+kernels = {id(v): v for m in modules for v in vars(m).values() if isinstance(v, Dispatcher)}
+print(len(kernels), sum(len(k.signatures) for k in kernels.values()))
+print(*sorted({"matplotlib", "skimage", "trimesh", "PIL", "tyro", "hypothesis"} & set(sys.modules)))
+"""
+
+
+def test_importing_isdf_is_quick_and_compiles_nothing() -> None:
+    """Beyond torch's own import, in CPU seconds; drawing, meshing and the command line load when they are used."""
+    run = subprocess.run(
+        [sys.executable, "-c", MEASURE], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    seconds, kernels, loaded = run.stdout.split("\n")[:3]
+    assert float(seconds) < 1.5
+    count, compiled = map(int, kernels.split())
+    assert count > 5 and compiled == 0
+    assert loaded == ""
+
+
+def uncached(tree: ast.AST) -> list[int]:
+    """Lines of numba decorators that compile on import or do not keep their code on the disk for the next run."""
+    bad = []
+    for node in ast.walk(tree):
+        for decorator in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+            called = decorator.func if isinstance(decorator, ast.Call) else decorator
+            if ast.unparse(called).split(".")[-1] not in ("njit", "jit", "vectorize", "guvectorize"):
+                continue
+            keywords = {k.arg: ast.unparse(k.value) for k in getattr(decorator, "keywords", [])}
+            if keywords.get("cache") != "True" or getattr(decorator, "args", []):
+                bad.append(decorator.lineno)
+    return bad
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_compiled_code_is_kept_between_runs(package: str) -> None:
+    found = {n: uncached(ast.parse(path.read_text())) for n, path in sources(ROOT, package).items()}
+    assert not {name: lines for name, lines in found.items() if lines}
+    text = "@njit\ndef a(): pass\n@njit(cache=True)\ndef b(): pass\n@nb.njit('f8(f8)', cache=True)\ndef c(): pass\n"
+    assert uncached(ast.parse(text)) == [1, 5]
+
+
 def test_the_checks_see_what_they_look_for(tmp_path) -> None:
     files = {
         "isdf/__init__.py": "from .a import f\n",

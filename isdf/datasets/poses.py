@@ -50,6 +50,7 @@ def from_quaternions(
     poses = np.full((len(positions), 4, 4), np.nan)
     norm = np.linalg.norm(quaternions, axis=1)
     usable = np.isfinite(norm) & (norm > 1e-6) & np.isfinite(positions).all(axis=1)
+    quaternions = quaternions / np.where(usable, norm, 1)[:, None]  # the squares of large ones overflow
     poses[usable] = np.eye(4)
     poses[usable, :3, 3] = positions[usable]
     if usable.any():
@@ -69,11 +70,11 @@ def poses_at(
     Args:
         times: when poses are wanted [s].
         stamps: when poses were measured [s], in any order.
-        poses: the measured rigid transforms; those that are not finite are left out.
+        poses: the measured rigid transforms; those that are not finite, or whose time is not, are left out.
         tolerance: the pose is NaN where the nearest measurement is further away than this [s].
         interpolate: linear in position and rotation angle; else the nearest measurement.
     """
-    finite = np.isfinite(poses).all(axis=(1, 2))
+    finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
     stamps, first = np.unique(stamps[finite], return_index=True)
     poses = poses[finite][first]
     out = np.full((len(times), 4, 4), np.nan)

@@ -7,6 +7,7 @@ groundtruth.txt  a line a pose: time stamp [s], tx ty tz [m], qx qy qz qw; camer
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -93,6 +94,8 @@ def _read_list(path: Path) -> tuple[np.ndarray, list[str]]:
         try:
             stamp, name = words
             stamps.append(float(stamp))
+            if not math.isfinite(stamps[-1]):
+                raise ValueError(f"a time stamp of {stamp} s")
         except ValueError as error:
             raise DatasetError(
                 f"{path}:{number}: expected a time stamp and a file name, got {line!r}"

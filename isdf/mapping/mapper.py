@@ -6,6 +6,7 @@ import functools
 import logging
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -201,11 +202,11 @@ class Mapper:
         """The CHOMP collision cost c(f(x)) with reach `eps` [m], over a snapshot of the field."""
         return CostField(self.field(), eps)
 
-    def save(self, path: str | Path) -> None:
-        """Write everything needed to go on mapping to one file, atomically, after a `refresh`."""
+    def save(self, path: str | Path, note: Mapping[str, Any] | None = None) -> None:
+        """Write everything to go on from to one file, atomically, after a `refresh`; `note` goes into its header."""
         from . import state
 
-        state.save(self, Path(path))
+        state.save(self, Path(path), note or {})
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Mapper:

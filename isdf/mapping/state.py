@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checkpoint import read, write
-from ..errors import CheckpointError, IsdfError
+from ..errors import CheckpointError
+from ..mapfile import consistent, read, write
 from .lattice import BLOCK
 from .mapper import Mapper, MapperConfig
 
@@ -22,8 +23,8 @@ VERSION = 1
 NODES = ("value", "confidence", "block", "evidence", "share", "width")
 
 
-def save(mapper: Mapper, path: Path) -> None:
-    """Write the whole state; an existing file is replaced only by a complete new one.
+def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
+    """Write the whole state, and `note` in the header; an existing file is replaced only by a complete new one.
 
     Raises:
         NotReadyError: no frame has been integrated yet.
@@ -42,8 +43,6 @@ def save(mapper: Mapper, path: Path) -> None:
     header = {
         "format": FORMAT,
         "version": VERSION,
-        "units": "metres",
-        "frame": "world",
         "config": dataclasses.asdict(mapper.config),
         "bricks_corner": bricks.corner.tolist(),
         "lattice_corner": lattice.corner.tolist(),
@@ -55,7 +54,7 @@ def save(mapper: Mapper, path: Path) -> None:
         "refreshed_at": _finite(mapper._refreshed_at),
         "guessed_at": _finite(mapper._guessed_at),
     }
-    write(path, tensors | {"bounds": bounds}, header)
+    write(path, tensors | {"bounds": bounds}, {**note, **header})
 
 
 def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
@@ -65,12 +64,8 @@ def load(path: Path, device: str | torch.device = "cpu") -> Mapper:
         CheckpointError: the file is missing, damaged, of another kind or of another version.
     """
     tensors, header = read(path, FORMAT, VERSION)
-    try:
+    with consistent(path):
         return _restored(tensors, header, device)
-    except (KeyError, TypeError, IndexError, RuntimeError, AttributeError, ValueError, IsdfError) as error:
-        raise CheckpointError(
-            f"{path}: the map is incomplete or inconsistent ({error}); map again"
-        ) from error
 
 
 def _restored(tensors: dict[str, Tensor], header: dict[str, Any], device: str | torch.device) -> Mapper:

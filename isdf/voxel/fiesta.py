@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,9 +114,9 @@ class FiestaMapper(VoxelMapper):
         """
         return super().field()
 
-    def save(self, path: Any) -> None:
+    def save(self, path: str | Path, note: Mapping[str, Any] | None = None) -> None:
         """Write the volume to one file, atomically, after a `refresh`; see `VoxelMapper.save`."""
-        super().save(path)
+        super().save(path, note)
         # The file has no lists: to go on just as a map that is loaded from it, this one makes them anew as well.
         self._make_lists()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,9 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .. import checkpoint
+from .. import mapfile
 from ..cost import CostField
-from ..errors import CheckpointError, ConfigError, IsdfError, NotReadyError
+from ..errors import CheckpointError, ConfigError, NotReadyError
 from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
 from .volume import GrowingVolume
@@ -123,8 +124,12 @@ class VoxelMapper(abc.ABC):
         """The CHOMP collision cost c(f(x)) with reach `eps` [m], over a snapshot of the field."""
         return CostField(self.field(), eps)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, note: Mapping[str, Any] | None = None) -> None:
         """Write the volume to one file, atomically, after a `refresh`.
+
+        Args:
+            path: the file.
+            note: further entries of the header, such as where the frames came from.
 
         Raises:
             NotReadyError: no frame has been integrated yet.
@@ -136,15 +141,13 @@ class VoxelMapper(abc.ABC):
         header = {
             "format": self.FORMAT,
             "version": self.VERSION,
-            "units": "metres",
-            "frame": "world",
             "config": dataclasses.asdict(self.config),
             "corner": self.volume.corner.tolist(),
             "frames_seen": self.frames_seen,
             "steps": self.steps,
             "rebuilt_at": None if math.isinf(self._rebuilt_at) else self._rebuilt_at,
         }
-        checkpoint.write(Path(path), tensors, header)
+        mapfile.write(Path(path), tensors, {**(note or {}), **header})
 
     @classmethod
     def load(cls, path: str | Path) -> Any:
@@ -153,13 +156,9 @@ class VoxelMapper(abc.ABC):
         Raises:
             CheckpointError: the file is missing, damaged, of another kind or of a newer version.
         """
-        tensors, header = checkpoint.read(Path(path), cls.FORMAT, cls.VERSION)
-        try:
+        tensors, header = mapfile.read(Path(path), cls.FORMAT, cls.VERSION)
+        with mapfile.consistent(Path(path)):
             return cls._restored(tensors, header)
-        except (KeyError, TypeError, ValueError, IndexError, IsdfError) as error:
-            raise CheckpointError(
-                f"{path}: the map is incomplete or inconsistent ({error}); map again"
-            ) from error
 
     @classmethod
     def _restored(cls, tensors: dict[str, Tensor], header: dict[str, Any]) -> VoxelMapper:

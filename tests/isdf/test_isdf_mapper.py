@@ -21,6 +21,7 @@ from isdf import (
     NetworkConfig,
     NotReadyError,
     SamplingConfig,
+    mapfile,
 )
 from isdf.keyframes import KeyframeSet, explained_share, render_depth
 from isdf.meshing import zero_level_mesh
@@ -261,7 +262,7 @@ def test_foreign_damaged_and_newer_files_are_refused(tmp_path) -> None:
     with pytest.raises(CheckpointError, match="version 99"):
         IsdfMapper.load(tmp_path / "newer")
     del tensors["network.layers.0.weight"]
-    save_file(tensors, tmp_path / "partial", {"isdf": json.dumps(header)})
+    mapfile.write(tmp_path / "partial", tensors, header)
     with pytest.raises(CheckpointError, match="incomplete or inconsistent"):
         IsdfMapper.load(tmp_path / "partial")
 
