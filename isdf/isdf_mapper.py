@@ -23,6 +23,7 @@ from .frames import DepthFrame
 from .keyframes import KeyframeConfig, KeyframeSet, explained_share
 from .losses import LossConfig, total_loss
 from .network import NetworkConfig, SDFNetwork
+from .numbers import require_finite
 from .sampling import RayBatch, SamplingConfig, sample_rays
 
 
@@ -67,6 +68,7 @@ class IsdfConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        require_finite(self)
         if self.bound not in ("ray", "normal", "batch"):
             raise ConfigError(f"bound must be one of ray, normal, batch; got {self.bound!r}")
         if not self.learning_rate > 0 or self.weight_decay < 0:

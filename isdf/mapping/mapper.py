@@ -21,6 +21,7 @@ from ..cost import CostField
 from ..errors import ConfigError, FrameError, NotReadyError
 from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
+from ..numbers import require_finite
 from .agreement import compare
 from .bricks import BrickVolume, missing_bricks
 from .completion import load_network
@@ -70,6 +71,13 @@ class MapperConfig:
     max_bricks: int = 8_000_000
 
     def __post_init__(self) -> None:
+        require_finite(
+            self,
+            (
+                "guess_period",
+                "refresh_period",
+            ),
+        )
         for name in ("voxel", "truncation", "max_depth", "max_weight", "max_bricks"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")
