@@ -131,7 +131,7 @@ def _as_rigid(T: Any) -> Tensor:
     if float(pose[:3, 3].abs().max()) > FARTHEST:
         raise FrameError(
             f"the camera is at {[f'{v:.3g}' for v in pose[:3, 3].tolist()]} m; only up to {FARTHEST:.0f} m from the "
-            "origin do numbers keep a centimetre: is it in millimetres? Else move the world's origin to where the robot is"
+            "origin do numbers keep a centimetre. In millimetres? Else move the world's origin to the robot"
         )
     rotation = pose[:3, :3]
     error = float((rotation @ rotation.T - torch.eye(3, dtype=pose.dtype)).abs().max())
