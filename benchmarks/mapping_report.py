@@ -157,13 +157,14 @@ def _curve(result: Result, name: str, scale: float) -> tuple[list[float], list[f
 
 
 def _mean_curves(by_sequence: list[dict]) -> dict:
-    """Mean over the sequences that a method has, up to the end of the shortest."""
+    """Mean over the sequences, up to the end of the shortest, of the methods that have them all."""
     length = min(len(runs[0][0]) for methods in by_sequence for runs in methods.values())
     mean = {}
-    for method in dict.fromkeys(m for methods in by_sequence for m in methods):
-        runs = [run for methods in by_sequence for run in methods.get(method, [])]
-        times, values = zip(*((t[:length], v[:length]) for t, v in runs), strict=True)
-        mean[method] = [(np.mean(times, axis=0), np.mean(values, axis=0))]
+    for method in by_sequence[0]:
+        if all(method in methods for methods in by_sequence):
+            runs = [run for methods in by_sequence for run in methods[method]]
+            times, values = zip(*((t[:length], v[:length]) for t, v in runs), strict=True)
+            mean[method] = [(np.mean(times, axis=0), np.mean(values, axis=0))]
     return mean
 
 

@@ -5,12 +5,17 @@ BaseTracker`.
 """
 
 from planning.chomp import Chomp, ChompConfig
+from planning.constraints import AxisConstraint, Constraint, GoalPose
+from planning.descent import DescentConfig
 from planning.errors import ConfigError, FieldError, PlanningError, SolverError, TrajectoryError
 from planning.initialise import NoPath, RrtConfig, rrt_connect
 from planning.metric import MetricConfig
 from planning.objective import ObjectiveConfig
 from planning.plan import Planner, PlannerConfig
+from planning.primitive_field import PrimitiveField, Solid
 from planning.protocols import (
+    CompilableField,
+    CompilableRobot,
     ConfidentField,
     CostField,
     DistanceField,
@@ -26,14 +31,20 @@ from planning.validation import Validation, ValidationConfig, check
 from planning.workspace import WorkspaceConfig
 
 __all__ = [
+    "AxisConstraint",
     "Chomp",
     "ChompConfig",
+    "CompilableField",
+    "CompilableRobot",
     "ConfidentField",
     "ConfigError",
+    "Constraint",
     "CostField",
+    "DescentConfig",
     "DistanceField",
     "FieldError",
     "FloorRobot",
+    "GoalPose",
     "LinkedRobot",
     "MetricConfig",
     "NoPath",
@@ -42,8 +53,10 @@ __all__ = [
     "Planner",
     "PlannerConfig",
     "PlanningError",
+    "PrimitiveField",
     "RrtConfig",
     "SelfCollidingRobot",
+    "Solid",
     "SolverError",
     "SphereRobot",
     "Status",

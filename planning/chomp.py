@@ -5,16 +5,20 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from planning.errors import ConfigError
+from planning.constraints import Constraint, project_to_constraints, violation
+from planning.descent import Descent, DescentConfig, descend
+from planning.errors import ConfigError, TrajectoryError
+from planning.hamiltonian import shaken
 from planning.limits import project_to_limits
 from planning.metric import Metric, MetricConfig
-from planning.objective import Evaluation, Objective, ObjectiveConfig
+from planning.objective import Objective, ObjectiveConfig
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
 from planning.trajectory import Trajectory
@@ -26,158 +30,216 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ChompConfig:
-    """How CHOMP descends and when it stops.
+    """How CHOMP descends and what it does where it gets stuck.
 
     Args:
         eps: distance [m] from a surface at which the obstacle cost starts; a CostField brings its own.
         metric: derivatives whose squares are the smoothness, and with it the metric A of the update.
         objective: weights of the parts of the objective.
+        descent: steps of the gradient descent, and when it ends.
         validation: the dense check that has the last word.
-        step: first step size 1 / eta of the update; it grows by a fifth after each decrease and halves after
-            each increase of the objective (which is undone).
-        max_update: no joint of any waypoint moves further than this in one iteration [rad | m].
         max_iterations: most evaluations of the objective.
-        tolerance: the cost is on a plateau when it fell by less than this fraction over `patience`
-            iterations.
-        patience: see tolerance.
-        polish: most iterations after the trajectory is free, for smoothness.
         max_tightenings: how often a plateau in collision is answered by a four times smaller smoothness
             weight (waypoints collide) or by twice as many states a segment (only the motion in between does).
+        restarts: how often a random smooth momentum (Hamiltonian Monte Carlo) throws the trajectories out of a
+            local minimum after that.
+        temperature: of the first restart; its root is the size of the momentum [rad | m]. Each restart has half of it.
         perturbation: size [rad | m] of the smooth random offset given to a trajectory that starts in
             collision, so that one through the middle of an obstacle can choose a side.
+        constraint_tolerance: largest violation of a constraint [rad | m] that counts as rounding.
     """
 
     eps: float = 0.1
     metric: MetricConfig = field(default_factory=MetricConfig)
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    descent: DescentConfig = field(default_factory=DescentConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
-    step: float = 1.0
-    max_update: float = 0.1
     max_iterations: int = 300
-    tolerance: float = 1e-2
-    patience: int = 10
-    polish: int = 50
     max_tightenings: int = 4
+    restarts: int = 2
+    temperature: float = 0.5
     perturbation: float = 1e-3
+    constraint_tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        if min(self.eps, self.step, self.max_update) <= 0 or self.patience < 1:
+        if min(self.eps, self.descent.step, self.descent.max_update) <= 0 or self.descent.patience < 1:
             raise ConfigError(
                 f"ChompConfig: eps, step, max_update and patience must be positive, got {self}."
             )
 
 
 class Chomp:
-    """Bends a trajectory out of collision and smooths it, its start and goal held exactly."""
+    """Bends trajectories out of collision and smooths them, their start and goal held exactly.
+
+    Args:
+        robot: what moves.
+        config: see `ChompConfig`.
+        seed: of the perturbation and of restarts.
+    """
 
     def __init__(self, robot: SphereRobot, config: ChompConfig | None = None, seed: int = 0) -> None:
         self.robot, self.config, self.seed = robot, config or ChompConfig(), seed
 
     def optimise(
-        self, trajectory: Trajectory, sdf: DistanceField | CostField, deadline: float | None = None
+        self,
+        trajectory: Trajectory | Sequence[Trajectory],
+        sdf: DistanceField | CostField,
+        deadline: float | None = None,
+        constraints: Sequence[Constraint] = (),
     ) -> PlanResult:
-        """Optimise a trajectory in a field.
+        """Optimise a trajectory, or a batch of them of which the best is returned, in a field.
 
         Args:
-            trajectory: the first guess; its times are kept.
+            trajectory: the first guess, or several with as many waypoints each (from other sides, to other goals); its
+                times are kept.
             sdf: distances, or a cost field that is then descended as it is.
-            deadline: wall time [s] allowed for the descent; the final check comes on top.
+            deadline: wall time [s] after which the best trajectory so far is returned, checked.
+            constraints: kept by projection; one with `goal_only` replaces the last waypoint as the goal.
 
         Returns:
             The best trajectory found (valid before free before cheap), with the verdict of the dense check
             on it.
 
         Raises:
-            TrajectoryError: if the trajectory does not fit the robot.
+            TrajectoryError: if the trajectories do not fit the robot or each other.
         """
-        robot, config = self.robot, self.config
         started = time.perf_counter()
-        history: list[float] = []
-        late = _Deadline(started, deadline)
-        verdict = check_ends(robot, trajectory, sdf, config.validation)
-        if verdict.success and len(trajectory) < 3:
-            verdict = check(robot, trajectory, sdf, config.validation)
-        if not verdict.success or len(trajectory) < 3:
-            return _result(trajectory, verdict, history, started)
+        guesses = [trajectory] if isinstance(trajectory, Trajectory) else list(trajectory)
+        self._check(guesses)
+        config, run = self.config, _Run(self.robot, sdf, self.config, constraints)
+        guesses, verdict = run.with_valid_ends(guesses)
+        if verdict is not None or len(guesses[0]) < 3:
+            verdict = verdict or run.judge(guesses[0])
+            return _result(guesses[0], verdict, [], started)
+        timer = time.perf_counter()
+        best = _Best(guesses[0], run.judge(guesses[0])) if deadline is not None else None
+        reserve = 1.3 * (time.perf_counter() - timer)  # a check takes about as long as the first one did
+        late = _Deadline(started, deadline, reserve)
 
-        workspace = Workspace(robot, sdf, config.eps, config.validation.workspace)
-        objective = Objective(robot, workspace, Metric(len(trajectory), config.metric), config.objective)
-        q = trajectory.waypoints.clone()
-        if not late() and not objective(q).free:
-            q = self._perturbed(q, objective.metric)
-        best, best_verdict = trajectory, None
-        for _ in range(config.max_tightenings + 1):
-            q, free = self._descend(objective, q, history, late)
-            candidate = Trajectory(q, trajectory.times)
-            verdict = check(robot, candidate, sdf, config.validation)
-            if best_verdict is None or _rank(verdict) > _rank(best_verdict):
-                best, best_verdict = candidate, verdict
-            if verdict.success or verdict.status is Status.INVALID_FIELD or late():
-                break
-            objective = objective.tightened(free)
-        assert best_verdict is not None
-        return _result(best, best_verdict, history, started)
-
-    def _descend(
-        self, objective: Objective, q: Float[Tensor, "n dof"], history: list[float], late: _Deadline
-    ) -> tuple[Float[Tensor, "n dof"], bool]:
-        """Covariant gradient descent to a plateau; the best waypoints seen and whether they are free."""
-        config, step, polished = self.config, self.config.step, 0
-        now = objective(q)
-        best_q, best = q, now
-        first = len(history)
-        while len(history) < config.max_iterations and math.isfinite(now.total) and not late():
-            history.append(now.total)
-            candidate = self._updated(q, now, step, objective.metric)
-            then = objective(candidate)
-            if then.total < now.total:
-                q, now, step = candidate, then, 1.2 * step
-                if now.free or not best.free:
-                    best_q, best = q, now
-            else:
-                step *= 0.5
-            polished += best.free
-            if polished >= config.polish or self._plateau(history[first:]):
-                break
-        return best_q, best.free
-
-    def _updated(
-        self, q: Float[Tensor, "n dof"], now: Evaluation, step: float, metric: Metric
-    ) -> Float[Tensor, "n dof"]:
-        """q - step A^-1 grad U (CHOMP, equation 8), each joint capped, projected to the joint limits."""
-        update = step * metric.solve(now.gradient)
-        update *= (self.config.max_update / update.abs().amax(dim=0).clamp_min(1e-12)).clamp_max(1.0)
-        interior = project_to_limits(q[1:-1] - update, self.robot.joint_limits, metric)
-        return torch.cat([q[:1], interior, q[-1:]])
-
-    def _plateau(self, totals: list[float]) -> bool:
-        config = self.config
-        if len(totals) <= config.patience:
-            return False
-        before, now = totals[-1 - config.patience], totals[-1]
-        return before - now <= config.tolerance * abs(before)
-
-    def _perturbed(self, q: Float[Tensor, "n dof"], metric: Metric) -> Float[Tensor, "n dof"]:
-        """Interior waypoints offset by smooth noise A^-1 z of the configured size."""
+        metric = Metric(len(guesses[0]), config.metric, free_goal=any(c.goal_only for c in constraints))
+        workspace = Workspace(self.robot, sdf, config.eps, config.validation.workspace)
+        objective = Objective(self.robot, workspace, metric, config.objective)
         generator = torch.Generator().manual_seed(self.seed)
-        noise = metric.solve(torch.randn(len(q) - 2, q.shape[1], generator=generator).to(q))
-        noise *= self.config.perturbation / noise.abs().amax(dim=0).clamp_min(1e-12)
-        interior = project_to_limits(q[1:-1] + noise, self.robot.joint_limits, metric)
-        return torch.cat([q[:1], interior, q[-1:]])
+        q = run.settled(torch.stack([guess.waypoints for guess in guesses]), metric)
+        if not late() and not objective(q).free.all():
+            q = self._perturbed(q, metric, generator, objective)
+        history: list[float] = []
+        for attempt in range(config.max_tightenings + config.restarts + 1):
+            descent = descend(
+                objective,
+                q,
+                config.descent,
+                lambda x: run.settled(x, metric),
+                history,
+                config.max_iterations,
+                late,
+            )
+            best = run.best_of(descent, guesses, best, late)
+            if best.verdict.success or best.verdict.status is Status.INVALID_FIELD or late():
+                break
+            if len(history) >= config.max_iterations or attempt == config.max_tightenings + config.restarts:
+                break
+            q = descent.q
+            if attempt < config.max_tightenings:
+                objective = objective.tightened(bool(descent.free[descent.order()[0]]))
+            else:
+                temperature = config.temperature * 0.5 ** (attempt - config.max_tightenings)
+                q = shaken(objective, q, temperature, generator, lambda x: run.settled(x, metric))
+        assert best is not None
+        return _result(best.trajectory, best.verdict, history, started)
+
+    def _check(self, guesses: list[Trajectory]) -> None:
+        if not guesses:
+            raise TrajectoryError("Chomp.optimise: got no trajectory; at least one first guess is needed.")
+        if len({len(guess) for guess in guesses}) != 1:
+            raise TrajectoryError(
+                f"Chomp.optimise: a batch needs as many waypoints each, got {[len(guess) for guess in guesses]}; "
+                "use Trajectory.resampled."
+            )
+
+    def _perturbed(
+        self, q: Float[Tensor, "b n dof"], metric: Metric, generator: torch.Generator, objective: Objective
+    ) -> Float[Tensor, "b n dof"]:
+        """Trajectories in collision, offset by smooth noise A^-1 z of the configured size."""
+        interior = q[:, metric.interior]
+        noise = metric.solve(torch.randn(interior.shape, generator=generator).to(q))
+        noise *= self.config.perturbation / noise.abs().amax(dim=1, keepdim=True).clamp_min(1e-12)
+        offset = q.clone()
+        offset[:, metric.interior] += noise.where(~objective(q).free[:, None, None], 0.0)
+        return offset
+
+
+@dataclass(frozen=True)
+class _Best:
+    trajectory: Trajectory
+    verdict: Validation
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Valid first, then by clearance; a clearance that is not a number is worst."""
+        clearance = self.verdict.clearance
+        return self.verdict.success, -math.inf if math.isnan(clearance) else clearance
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One problem: the robot in a field, under constraints."""
+
+    robot: SphereRobot
+    sdf: DistanceField | CostField
+    config: ChompConfig
+    constraints: Sequence[Constraint]
+
+    def with_valid_ends(self, guesses: list[Trajectory]) -> tuple[list[Trajectory], Validation | None]:
+        """The guesses whose ends are valid; where none's are, the first one's verdict."""
+        verdicts = []
+        for guess in guesses:
+            ends = guess
+            if any(c.goal_only for c in self.constraints):  # the goal is still to be found
+                ends = Trajectory(guess.waypoints[:1], guess.times[:1])
+            verdicts.append(check_ends(self.robot, ends, self.sdf, self.config.validation))
+        valid = [guess for guess, verdict in zip(guesses, verdicts, strict=True) if verdict.success]
+        return (valid, None) if valid else (guesses[:1], verdicts[0])
+
+    def settled(self, q: Float[Tensor, "b n dof"], metric: Metric) -> Float[Tensor, "b n dof"]:
+        """Trajectories brought back to the constraints and the joint limits, smoothly."""
+        if self.constraints:
+            q = torch.stack([project_to_constraints(one, metric, self.constraints) for one in q])
+        inner = project_to_limits(q[:, metric.interior], self.robot.joint_limits, metric)
+        return torch.cat([q[:, :1], inner, q[:, 1 + inner.shape[1] :]], dim=1)
+
+    def judge(self, trajectory: Trajectory) -> Validation:
+        """The dense check, and the constraints."""
+        verdict = check(self.robot, trajectory, self.sdf, self.config.validation)
+        excess = violation(self.constraints, trajectory.waypoints)
+        if not verdict.success or excess <= self.config.constraint_tolerance:
+            return verdict
+        message = f"a constraint is violated by {excess:.2g} (tolerance {self.config.constraint_tolerance:g})"
+        return replace(verdict, status=Status.CONSTRAINT, message=message)
+
+    def best_of(
+        self, descent: Descent, guesses: list[Trajectory], best: _Best | None, late: _Deadline
+    ) -> _Best:
+        """The first valid one of a descent's trajectories, else the best of all that were judged."""
+        for i in descent.order():
+            candidate = Trajectory(descent.q[i], guesses[i].times)
+            judged = _Best(candidate, self.judge(candidate))
+            if best is None or judged.rank > best.rank or (judged.verdict.success and best.verdict.success):
+                best = judged
+            if judged.verdict.success or late():
+                break
+        assert best is not None
+        return best
 
 
 @dataclass(frozen=True)
 class _Deadline:
     started: float
     seconds: float | None
+    reserve: float
 
     def __call__(self) -> bool:
-        return self.seconds is not None and time.perf_counter() - self.started >= self.seconds
-
-
-def _rank(verdict: Validation) -> tuple[bool, float]:
-    """Valid first, then by clearance; a clearance that is not a number is worst."""
-    return verdict.success, -math.inf if math.isnan(verdict.clearance) else verdict.clearance
+        return self.seconds is not None and time.perf_counter() - self.started >= self.seconds - self.reserve
 
 
 def _result(trajectory: Trajectory, verdict: Validation, history: list[float], started: float) -> PlanResult:

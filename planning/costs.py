@@ -22,11 +22,11 @@ def hinge_cost(
 
 
 def arc_length_cost(
-    points: Float[Tensor, "n s 3"],
-    cost: Float[Tensor, "n s"],
-    cost_gradient: Float[Tensor, "n s 3"],
+    points: Float[Tensor, "*batch n s 3"],
+    cost: Float[Tensor, "*batch n s"],
+    cost_gradient: Float[Tensor, "*batch n s 3"],
     guard: float = 1e-3,
-) -> tuple[Float[Tensor, ""], Float[Tensor, "n s 3"]]:
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch n s 3"]]:
     """Obstacle functional of the paths of s spheres and its exact gradient (CHOMP, equations 18 and 23).
 
     U = sum over segments of (c_i + c_{i+1}) / 2 * l_i, the trapezoid rule of the integral of c |x'| dt, with
@@ -41,39 +41,38 @@ def arc_length_cost(
         guard: [m].
 
     Returns:
-        U summed over spheres [m^2], and dU/dx (n, s, 3).
+        U summed over spheres [m^2], and dU/dx of the shape of the points.
     """
-    steps = points.diff(dim=0)
+    steps = points.diff(dim=-3)
     lengths = (steps.square().sum(-1) + guard**2).sqrt()
-    means = 0.5 * (cost[:-1] + cost[1:])
+    means = 0.5 * (cost[..., :-1, :] + cost[..., 1:, :])
     pull = (means / lengths).unsqueeze(-1) * steps  # mean cost times the unit tangent
     half = 0.5 * lengths.unsqueeze(-1)
     gradient = torch.zeros_like(points)
-    gradient[:-1] += half * cost_gradient[:-1] - pull
-    gradient[1:] += half * cost_gradient[1:] + pull
-    return (means * lengths).sum(), gradient
+    gradient[..., :-1, :, :] += half * cost_gradient[..., :-1, :, :] - pull
+    gradient[..., 1:, :, :] += half * cost_gradient[..., 1:, :, :] + pull
+    return (means * lengths).sum((-2, -1)), gradient
 
 
 def self_collision_cost(
-    centres: Float[Tensor, "n s 3"],
+    centres: Float[Tensor, "*batch n s 3"],
     radii: Float[Tensor, " s"],
     pairs: Int[Tensor, "p 2"],
     eps: float,
-) -> tuple[Float[Tensor, ""], Float[Tensor, "n s 3"], Float[Tensor, " n"]]:
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch n s 3"], Float[Tensor, "*batch n"]]:
     """Sum over waypoints and pairs of c(gap between two spheres), averaged over the waypoints.
 
     Returns:
         The cost [m], its gradient with respect to the centres, and the smallest gap [m] at each waypoint.
     """
-    first, second = pairs[:, 0], pairs[:, 1]
-    offset = centres[:, first] - centres[:, second]
-    gap = offset.norm(dim=-1) - (radii[first] + radii[second])
-    n, s = centres.shape[:2]
-    waypoint, pair = (gap < eps).nonzero(as_tuple=True)  # few of many: the rest costs nothing
-    cost, slope = hinge_cost(gap[waypoint, pair], eps)
-    direction = torch.nn.functional.normalize(offset[waypoint, pair], dim=-1, eps=1e-9)
-    push = slope.unsqueeze(-1) * direction / n
-    gradient = centres.new_zeros(n * s, 3)
-    gradient.index_add_(0, waypoint * s + first[pair], push)
-    gradient.index_add_(0, waypoint * s + second[pair], -push)
-    return cost.sum() / n, gradient.view_as(centres), gap.amin(dim=1)
+    from planning.compiled.self_collision import pair_costs
+
+    n, s = centres.shape[-3:-1]
+    flat = centres.detach().reshape(-1, s, 3).double().numpy()
+    cost, gradient, gap = pair_costs(flat, radii.double().numpy(), pairs.numpy(), eps)
+    batch = centres.shape[:-2]
+    return (
+        torch.from_numpy(cost).to(centres).view(batch).mean(-1),
+        torch.from_numpy(gradient).to(centres).view_as(centres) / n,
+        torch.from_numpy(gap).to(centres).view(batch),
+    )

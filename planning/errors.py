@@ -21,3 +21,7 @@ class FieldError(PlanningError):
 
 class SolverError(PlanningError):
     """A numerical solver that could not be built or that failed on a well-posed problem."""
+
+
+class ProblemError(PlanningError):
+    """A file of planning problems, or a robot named for it, that cannot be used."""

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from planning.errors import ConfigError, TrajectoryError
+from planning.exact_shape import exact_shape
 from planning.protocols import CostField, DistanceField, SelfCollidingRobot, SphereRobot
 from planning.validation import within_limits
 from planning.workspace import Workspace, WorkspaceConfig
@@ -43,6 +44,8 @@ class RrtConfig:
         shortcut_rounds: batches of random shortcuts tried on the path.
         max_nodes: nodes of both trees after which the search gives up.
         seconds: wall time [s] after which the search gives up.
+        candidates: paths found and shortened, of which the shortest is taken; only where robot and field can be
+            compiled, since a path then costs milliseconds.
         workspace: rules for the floor and for unknown space, which counts as blocked.
     """
 
@@ -58,6 +61,7 @@ class RrtConfig:
     shortcut_rounds: int = 60
     max_nodes: int = 20_000
     seconds: float = 10.0
+    candidates: int = 3
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
 
     def __post_init__(self) -> None:
@@ -83,7 +87,7 @@ def rrt_connect(
     config: RrtConfig | None = None,
     seed: int = 0,
 ) -> Float[Tensor, "k dof"] | NoPath:
-    """Find a collision-free path from start to goal, shortened by random shortcuts.
+    """Find a collision-free path from start to goal, shortened by random shortcuts; compiled where possible.
 
     Returns:
         (k, dof) vertices joined by free straight edges, first and last exactly start and goal; or NoPath.
@@ -96,6 +100,11 @@ def rrt_connect(
         if len(q) != robot.num_dofs:
             raise TrajectoryError(f"rrt_connect: {name} has {len(q)} joints, the robot has {robot.num_dofs}.")
     deadline = time.perf_counter() + config.seconds
+    shape = exact_shape(robot, sdf, config.workspace)
+    if shape is not None:
+        from planning.exact_search import search
+
+        return search(shape, start, goal[None], config, seed, deadline)
     space = StateSpace(robot, sdf, start, goal, config)
     for name, q in (("start", start), ("goal", goal)):
         if not space.free(q[None])[0]:

@@ -9,12 +9,12 @@ from planning.metric import Metric
 
 
 def project_to_limits(
-    q: Float[Tensor, "n_interior dof"],
+    q: Float[Tensor, "*batch n_interior dof"],
     limits: Float[Tensor, "dof 2"],
     metric: Metric,
     iterations: int = 20,
     tolerance: float = 1e-6,
-) -> Float[Tensor, "n_interior dof"]:
+) -> Float[Tensor, "*batch n_interior dof"]:
     """Bring interior waypoints within the limits by smooth corrections A^-1 v (CHOMP, section 3.5).
 
     v is the violation; each round scales the correction of a joint so that its worst waypoint lands on its
@@ -23,11 +23,10 @@ def project_to_limits(
     low, high = limits.to(q).unbind(dim=1)
     for _ in range(iterations):
         violation = (low - q).clamp_min(0) - (q - high).clamp_min(0)
-        size, worst = violation.abs().max(dim=0)
+        size, worst = violation.abs().max(dim=-2, keepdim=True)
         if size.max() <= tolerance:
             break
         correction = metric.solve(violation)
-        at_worst = correction.gather(0, worst[None])[0]
-        wanted = violation.gather(0, worst[None])[0]
+        at_worst, wanted = correction.gather(-2, worst), violation.gather(-2, worst)
         q = q + correction * (wanted / at_worst).where(size > 0, 0.0)
     return q.clamp(low, high)

@@ -45,11 +45,14 @@ class Metric:
     A = sum_d w_d K_d^T K_d + ridge. K_d are finite differences of order d; before the first and after the
     last waypoint the robot rests. The first and last waypoint are fixed, so A is over the n - 2 interior
     ones. The whole is scaled so that a unit push on the waypoint that gives way most moves it by one unit,
-    whichever derivatives are weighted (CHOMP, equations 10-17). Matrices are kept in float64 (A is
-    ill-conditioned), arguments keep their type.
+    whichever derivatives are weighted (CHOMP, equations 10-17). With `free_goal` the last waypoint counts
+    as an interior one, for goals that are constraints. Matrices are kept in float64 (A is ill-conditioned),
+    arguments keep their type.
     """
 
-    def __init__(self, num_waypoints: int, config: MetricConfig | None = None) -> None:
+    def __init__(
+        self, num_waypoints: int, config: MetricConfig | None = None, free_goal: bool = False
+    ) -> None:
         if num_waypoints < 3:
             raise ConfigError(
                 f"Metric: at least 3 waypoints are needed, got {num_waypoints}; resample first."
@@ -61,20 +64,31 @@ class Metric:
             if weight > 0:
                 difference = _difference_matrix(num_waypoints, order) / step**order
                 full += weight * step * difference.T @ difference
-        interior = full[1:-1, 1:-1]
-        ridge = config.ridge * interior.diagonal().max() * torch.eye(num_waypoints - 2, dtype=torch.float64)
-        response = torch.linalg.inv(interior + ridge).diagonal().max()  # makes the largest entry of A^-1 one
+        self.free_goal = free_goal
+        self.interior = slice(1, num_waypoints if free_goal else num_waypoints - 1)
+        interior = full[self.interior, self.interior]
+        ridge = config.ridge * interior.diagonal().max() * torch.eye(len(interior), dtype=torch.float64)
+        inverse = torch.linalg.inv(interior + ridge)
+        response = inverse.diagonal().max()  # makes the largest entry of A^-1 one
         self._full = full * response
-        self._factor = torch.linalg.cholesky((interior + ridge) * response)
+        self.inverse = inverse / response
 
-    def smoothness(self, q: Float[Tensor, "n dof"]) -> tuple[float, Float[Tensor, "n_interior dof"]]:
+    def smoothness(
+        self, q: Float[Tensor, "*batch n dof"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch n_interior dof"]]:
         """F(q) and its gradient with respect to the interior waypoints."""
         product = self._full @ q.double()
-        return 0.5 * float((product * q).sum()), product[1:-1].to(q)
+        return 0.5 * (product * q).sum((-2, -1)), product[..., self.interior, :].to(q)
 
-    def solve(self, gradient: Float[Tensor, "n_interior k"]) -> Float[Tensor, "n_interior k"]:
+    def solve(self, gradient: Float[Tensor, "*batch n_interior k"]) -> Float[Tensor, "*batch n_interior k"]:
         """A^-1 times a gradient over the interior waypoints."""
-        return torch.cholesky_solve(gradient.double(), self._factor).to(gradient)
+        return (self.inverse @ gradient.double()).to(gradient)
+
+    def smooth_noise(
+        self, noise: Float[Tensor, "*batch n_interior k"]
+    ) -> Float[Tensor, "*batch n_interior k"]:
+        """Standard normal numbers turned into a sample of N(0, A^-1): a smooth random motion."""
+        return (torch.linalg.cholesky(self.inverse) @ noise.double()).to(noise)
 
 
 def _difference_matrix(num_waypoints: int, order: int) -> Float[Tensor, "rows n"]:

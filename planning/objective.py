@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from planning.costs import arc_length_cost, hinge_cost, self_collision_cost
 from planning.errors import ConfigError
 from planning.metric import Metric
 from planning.protocols import SelfCollidingRobot, SphereRobot
+from planning.sphere_kinematics import kinematics_of
 from planning.workspace import Workspace
 
 
@@ -45,7 +46,7 @@ class ObjectiveConfig:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The objective at one trajectory.
+    """The objective at a trajectory or at each of a batch.
 
     Args:
         total: the weighted sum.
@@ -53,16 +54,24 @@ class Evaluation:
         free: whether every state looked at keeps clear of obstacles and of itself.
     """
 
-    total: float
-    gradient: Float[Tensor, "n_interior dof"]
-    free: bool
+    total: Float[Tensor, "*batch"]
+    gradient: Float[Tensor, "*batch n_interior dof"]
+    free: Bool[Tensor, "*batch"]
+
+    def where(self, choice: Bool[Tensor, "*batch"], other: Evaluation) -> Evaluation:
+        """This evaluation where chosen, the other one elsewhere."""
+        return Evaluation(
+            torch.where(choice, self.total, other.total),
+            torch.where(choice[..., None, None], self.gradient, other.gradient),
+            torch.where(choice, self.free, other.free),
+        )
 
 
 class Objective:
     """Evaluates trajectories of n waypoints; looks at `substeps` states a segment.
 
-    The gradient is exact for the discrete objective: spheres are pulled back to the joints by one
-    vector-Jacobian product through `robot.spheres`, and states within a segment to its two waypoints.
+    The gradient is exact for the discrete objective: spheres are pulled back to the joints by J^T, and states
+    within a segment to its two waypoints.
     """
 
     def __init__(
@@ -75,35 +84,41 @@ class Objective:
     ) -> None:
         self.robot, self.workspace, self.metric, self.config = robot, workspace, metric, config
         self.substeps = substeps
+        self._kinematics = kinematics_of(robot)
         pairs = robot.self_collision_pairs if isinstance(robot, SelfCollidingRobot) else None
         self._pairs = pairs if pairs is not None and len(pairs) else None
+        self._known_radii: Tensor | None = None
         margin = torch.tensor(config.margin, dtype=torch.float64)
         self._free_cost = float(hinge_cost(margin, workspace.eps)[0]) + 1e-7
 
-    def __call__(self, q: Float[Tensor, "n dof"]) -> Evaluation:
-        """Evaluate waypoints q [rad | m], the first and last of which are fixed."""
-        spread = _interpolation_matrix(len(q), self.substeps).to(q)
-        states = (spread @ q).requires_grad_()
-        with torch.enable_grad():
-            centres, radii = self.robot.spheres(states)
-        x = centres.detach()
+    def __call__(self, q: Float[Tensor, "*batch n dof"]) -> Evaluation:
+        """Evaluate waypoints q [rad | m], the first and (unless the metric frees it) the last of which are fixed."""
+        spread = _interpolation_matrix(q.shape[-2], self.substeps).to(q)
+        states = spread @ q
+        x, radii = self._kinematics.centres(states), self._radii(q)
         cost, cost_gradient = self.workspace.cost_and_gradient(x, radii)
         obstacles, pull = arc_length_cost(x, cost, cost_gradient)
         obstacles, pull = self.config.obstacle_weight * obstacles, self.config.obstacle_weight * pull
-        ends = torch.maximum(
-            cost[0].max(), cost[-1].max()
-        )  # these are valid, or there is nothing to optimise
-        free = bool((cost <= ends.clamp_min(self._free_cost)).all())
+        # Start and goal are valid, or there is nothing to optimise; what costs no more than they is free.
+        ends = cost[..., [0, -1], :].amax((-2, -1)).clamp_min(self._free_cost)
+        free = (cost <= ends[..., None, None]).all(-1).all(-1)
         if self._pairs is not None:
             touch, push, gap = self_collision_cost(x, radii, self._pairs, self.config.self_collision_eps)
             obstacles = obstacles + self.config.self_collision_weight * touch
             pull = pull + self.config.self_collision_weight * push
-            free = free and bool((gap >= 0).all())
-        (state_gradient,) = torch.autograd.grad(centres, states, pull)
+            ends_gap = gap[..., [0, -1]].amin(-1, keepdim=True).clamp_max(0.0)
+            free &= (gap >= ends_gap).all(-1)
+        state_gradient = self._kinematics.pull_back(states, x, pull)
         smoothness, smoothness_gradient = self.metric.smoothness(q)
         weight = self.config.smoothness_weight
-        gradient = weight * smoothness_gradient + (spread.T @ state_gradient)[1:-1]
-        return Evaluation(weight * smoothness + float(obstacles), gradient, free)
+        gradient = weight * smoothness_gradient + (spread.T @ state_gradient)[..., self.metric.interior, :]
+        return Evaluation(weight * smoothness + obstacles, gradient, free)
+
+    def _radii(self, q: Float[Tensor, "*batch n dof"]) -> Float[Tensor, " s"]:
+        if self._known_radii is None or self._known_radii.dtype != q.dtype:
+            with torch.no_grad():
+                self._known_radii = self.robot.spheres(q.reshape(-1, q.shape[-1])[0])[1].to(q)
+        return self._known_radii
 
     def tightened(self, waypoints_free: bool) -> Objective:
         """The objective for a trajectory that converged in collision.

@@ -6,11 +6,13 @@ import logging
 import time
 from dataclasses import dataclass, field, replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from planning.chomp import Chomp, ChompConfig
 from planning.errors import ConfigError
+from planning.exact_shape import exact_shape
 from planning.initialise import NoPath, RrtConfig, rrt_connect
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
@@ -43,10 +45,11 @@ class PlannerConfig:
 
 
 class Planner:
-    """Plans by optimisation, and falls back on search.
+    """Plans by search and optimisation; whatever is returned as a success passed the dense check.
 
-    1. CHOMP from the warm start or the straight line. 2. If that collides, CHOMP from a path of RRT-Connect.
-    3. If that collides, the searched path itself. Whatever is returned as a success passed the dense check.
+    Where robot and field can be compiled a search costs milliseconds, so it comes first and CHOMP shortens and smooths
+    its path. Elsewhere CHOMP bends the straight line (or the warm start) first, and searches only where that collides.
+    If CHOMP leaves the free path of a search, that path itself is the plan.
     """
 
     def __init__(self, robot: SphereRobot, config: PlannerConfig | None = None, seed: int = 0) -> None:
@@ -55,12 +58,12 @@ class Planner:
     def plan(
         self,
         start: Float[Tensor, " dof"],
-        goal: Float[Tensor, " dof"],
+        goal: Float[Tensor, " dof"] | Float[Tensor, "g dof"],
         sdf: DistanceField | CostField,
         warm_start: Trajectory | None = None,
         deadline: float | None = None,
     ) -> PlanResult:
-        """Plan from start to goal [rad | m].
+        """Plan from start to a goal, or to whichever of several is reached best [rad | m].
 
         Args:
             start: exactly the first waypoint.
@@ -68,7 +71,7 @@ class Planner:
             sdf: the field to keep clear of.
             warm_start: a trajectory to bend first, such as the last plan; its ends are replaced by start and
                 goal.
-            deadline: wall time [s] for the whole; checks come on top.
+            deadline: wall time [s] for the whole.
 
         Raises:
             TrajectoryError: if start, goal or warm start do not fit the robot.
@@ -78,42 +81,75 @@ class Planner:
         def left() -> float | None:
             return None if deadline is None else max(0.0, deadline - (time.perf_counter() - started))
 
+        goals = goal.reshape(-1, goal.shape[-1])
+        lines = [Trajectory.line(start, g, config.num_waypoints, config.duration) for g in goals]
+        verdicts = [check_ends(self.robot, line, sdf, config.chomp.validation) for line in lines]
+        lines = [line for line, verdict in zip(lines, verdicts, strict=True) if verdict.success]
+        if not lines:
+            seconds, first = time.perf_counter() - started, verdicts[0]
+            line = Trajectory.line(start, goals[0], config.num_waypoints, config.duration)
+            return PlanResult(line, first.status, first.message, first.clearance, (), 0, seconds)
+        guesses = [self._warm(warm_start, line) for line in lines]
         chomp = Chomp(self.robot, config.chomp, self.seed)
-        line = Trajectory.line(start, goal, config.num_waypoints, config.duration)
-        verdict = check_ends(self.robot, line, sdf, config.chomp.validation)
-        if not verdict.success:
-            seconds = time.perf_counter() - started
-            return PlanResult(line, verdict.status, verdict.message, verdict.clearance, (), 0, seconds)
-        first = chomp.optimise(self._warm(warm_start, line), sdf, left())
-        if first.success:
-            return replace(first, seconds=time.perf_counter() - started)
-
-        seconds_left = left()
-        rrt = (
-            config.rrt
-            if seconds_left is None
-            else replace(config.rrt, seconds=min(config.rrt.seconds, seconds_left))
-        )
-        path = rrt_connect(self.robot, sdf, start, goal, rrt, self.seed)
+        unaided = None
+        if warm_start is not None or exact_shape(self.robot, sdf, config.rrt.workspace) is None:
+            unaided = chomp.optimise(guesses, sdf, left())
+            if unaided.success:
+                return replace(unaided, seconds=time.perf_counter() - started)
+        path = self._search(start, torch.stack([line.waypoints[-1] for line in lines]), sdf, left())
         if isinstance(path, NoPath):
-            message = f"{path.message}; CHOMP from the first guess: {first.message}"
-            return replace(
-                first, status=Status.NO_PATH, message=message, seconds=time.perf_counter() - started
-            )
-        second = chomp.optimise(Trajectory.through(path, config.num_waypoints, config.duration), sdf, left())
-        if second.success:
-            return replace(second, seconds=time.perf_counter() - started)
+            unaided = unaided or chomp.optimise(guesses, sdf, left())
+            if not unaided.success:
+                message = f"{path.message}; CHOMP from the first guess: {unaided.message}"
+                unaided = replace(unaided, status=Status.NO_PATH, message=message)
+            return replace(unaided, seconds=time.perf_counter() - started)
+        result = self._smoothed(path, sdf, chomp, left())
+        return replace(result, seconds=time.perf_counter() - started)
 
-        logger.info("CHOMP left the free path of the search (%s); returning that path", second.message)
+    def _search(
+        self,
+        start: Float[Tensor, " dof"],
+        goals: Float[Tensor, "g dof"],
+        sdf: DistanceField | CostField,
+        seconds: float | None,
+    ) -> Float[Tensor, "k dof"] | NoPath:
+        """A free path to the first goal that a search reaches."""
+        rrt = (
+            self.config.rrt
+            if seconds is None
+            else replace(self.config.rrt, seconds=min(self.config.rrt.seconds, seconds))
+        )
+        path: Float[Tensor, "k dof"] | NoPath = NoPath("no goal")
+        for goal in goals:
+            path = rrt_connect(
+                self.robot, sdf, start, goal, replace(rrt, seconds=rrt.seconds / len(goals)), self.seed
+            )
+            if not isinstance(path, NoPath):
+                break
+        return path
+
+    def _smoothed(
+        self,
+        path: Float[Tensor, "k dof"],
+        sdf: DistanceField | CostField,
+        chomp: Chomp,
+        seconds: float | None,
+    ) -> PlanResult:
+        """CHOMP from a searched path, or where it leaves what is free, that path."""
+        config = self.config
+        guess = Trajectory.through(path, config.num_waypoints, config.duration)
+        result = chomp.optimise(guess, sdf, seconds)
+        if result.success:
+            return result
+        logger.info("CHOMP left the free path of the search (%s); returning that path", result.message)
         searched = Trajectory.through(path, duration=config.duration)
         verdict = check(self.robot, searched, sdf, config.chomp.validation)
         return replace(
-            second,
+            result,
             trajectory=searched,
             status=verdict.status,
             message=f"path of the search, not optimised: {verdict.message}",
             clearance=verdict.clearance,
-            seconds=time.perf_counter() - started,
         )
 
     def _warm(self, warm_start: Trajectory | None, line: Trajectory) -> Trajectory:

@@ -6,9 +6,10 @@ their own, so that `isinstance` tells whether they are there.
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from torch import Tensor
 
 
@@ -115,4 +116,42 @@ class FloorRobot(SphereRobot, Protocol):
     @property
     def floor_spheres(self) -> Bool[Tensor, " s"]:
         """True for spheres that may touch the floor (and nothing else)."""
+        ...
+
+
+@runtime_checkable
+class CompilableRobot(LinkedRobot, Protocol):
+    """A robot that lays its kinematics and its exact shape open, so that planning can compile them."""
+
+    @property
+    def chain(self) -> Any:
+        """The moving joints, parents first: arrays parent, origin, axis, prismatic, column, multiplier and offset.
+
+        Joint j carries frame j + 1, frame 0 is the root; frame j + 1 is `origin[j]` in its parent followed by a turn
+        about (or slide along) `axis[j]` by multiplier[j] * q[column[j]] + offset[j] [rad | m].
+        """
+        ...
+
+    @property
+    def placed_spheres(self) -> tuple[Int[ndarray, " s"], Float[ndarray, "s 4"]]:
+        """Of every sphere, in the order of `spheres`: its frame, and its centre there with its radius [m]."""
+        ...
+
+    def fine_spheres(self) -> tuple[Int[ndarray, " m"], Float[ndarray, "m 4"], Int[ndarray, " m"]]:
+        """The same for a cover so fine that it decides what collides, and the link of each, grouped by links."""
+        ...
+
+    @property
+    def link_pairs(self) -> Int[ndarray, "p 2"]:
+        """Pairs of those links that must not touch."""
+        ...
+
+
+@runtime_checkable
+class CompilableField(DistanceField, Protocol):
+    """A field of boxes, cylinders and balls, or of a voxel grid, that lays them open as arrays."""
+
+    @property
+    def solids(self) -> Any:
+        """Arrays kind (n,) (0 box, 1 cylinder, 2 ball), turn (n, 3, 3) to solid, centre, size, grid, low, voxel."""
         ...

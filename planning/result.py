@@ -18,6 +18,7 @@ class Status(enum.Enum):
     SELF_COLLISION = "self-collision"
     JOINT_LIMITS = "joint limits"
     INVALID_FIELD = "invalid field"
+    CONSTRAINT = "constraint violated"
     NO_PATH = "no path"
 
 

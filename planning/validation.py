@@ -11,8 +11,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from planning.errors import ConfigError, TrajectoryError
+from planning.exact_shape import exact_shape
 from planning.protocols import CostField, DistanceField, LinkedRobot, SelfCollidingRobot, SphereRobot
 from planning.result import Status
+from planning.sphere_kinematics import kinematics_of
 from planning.trajectory import Trajectory
 from planning.workspace import Workspace, WorkspaceConfig
 
@@ -94,7 +96,7 @@ def check(
     check_dofs(robot, trajectory)
     workspace = Workspace(robot, sdf, eps=1.0, config=config.workspace)
     samples = _dense_states(robot, trajectory, config)
-    worst_depth, worst_sphere, worst_gap, worst_pair = _measure(robot, workspace, samples.states)
+    worst_depth, worst_sphere, worst_gap, worst_pair = _measure(robot, workspace, samples.states, config)
     report = _Report(robot, trajectory, samples, worst_depth, worst_gap)
     name = _sphere_name(robot)
 
@@ -228,18 +230,24 @@ def _dense_states(robot: SphereRobot, trajectory: Trajectory, config: Validation
 
 def _sphere_motion(robot: SphereRobot, states: Float[Tensor, "m dof"]) -> Float[Tensor, " m-1"]:
     """Largest motion [m] of any sphere between consecutive states."""
-    chunk, motions = 2000, []
+    chunk, motions, kinematics = 2000, [], kinematics_of(robot)
     with torch.no_grad():
         for first in range(0, len(states) - 1, chunk):
-            centres, _ = robot.spheres(states[first : first + chunk + 1])
+            centres = kinematics.centres(states[first : first + chunk + 1])
             motions.append(centres.diff(dim=0).norm(dim=-1).amax(dim=1))
     return torch.cat(motions)
 
 
 def _measure(
-    robot: SphereRobot, workspace: Workspace, states: Float[Tensor, "m dof"]
+    robot: SphereRobot, workspace: Workspace, states: Float[Tensor, "m dof"], config: ValidationConfig
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, " m"], Int[Tensor, "m 2"]]:
-    """Least clearance and its sphere, least self-collision gap and its pair, for every state."""
+    """Least clearance and its sphere, least self-collision gap and its pair, for every state.
+
+    By the robot's exact shape where it and the field can be compiled, else by its spheres.
+    """
+    shape = exact_shape(robot, workspace.field, config.workspace)
+    if shape is not None:
+        return shape.measure(states, config.margin, config.self_margin)
     pairs = robot.self_collision_pairs if isinstance(robot, SelfCollidingRobot) else None
     depths, spheres, gaps, worst = [], [], [], []
     with torch.no_grad():

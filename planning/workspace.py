@@ -10,7 +10,14 @@ from torch import Tensor
 
 from planning.costs import hinge_cost
 from planning.errors import ConfigError, FieldError
-from planning.protocols import ConfidentField, CostField, DistanceField, FloorRobot, SphereRobot
+from planning.protocols import (
+    CompilableField,
+    ConfidentField,
+    CostField,
+    DistanceField,
+    FloorRobot,
+    SphereRobot,
+)
 
 MIN_FLOOR_SLOPE = 0.5  # upward component of a field's gradient where the floor, and not a wall, is nearest
 
@@ -109,17 +116,32 @@ class Workspace:
                 cost = cost.masked_fill(exempt, 0.0)
                 gradient = gradient.masked_fill(exempt.unsqueeze(-1), 0.0)
         else:
-            clearance = self.clearance(centres, radii)
-            near = clearance < self.eps
-            gradient = torch.zeros_like(centres)
-            if near.any():  # most spheres are far from anything, and gradients cost more than distances
-                gradient[near] = self.field.distance_and_gradient(centres[near])[1].detach()
+            clearance, gradient = self._clearance_and_gradient(centres, radii)
             cost, slope = hinge_cost(clearance, self.eps)
             gradient = slope.unsqueeze(-1) * gradient
         unknown = self.unknown(centres)
         if unknown is not None:
             cost = torch.where(unknown, cost.clamp_min(0.5 * self.eps), cost)
         return cost, gradient
+
+    def _clearance_and_gradient(
+        self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, " s"]
+    ) -> tuple[Float[Tensor, "*batch s"], Float[Tensor, "*batch s 3"]]:
+        """Clearances, and gradients of the field where they are below eps."""
+        if isinstance(self.field, CompilableField):  # one pass costs less than two
+            distance, gradient = self.field.distance_and_gradient(centres)
+            clearance = distance - radii
+            if self.floor is not None:
+                clearance = clearance.masked_fill(
+                    self._on_floor(distance[..., self.floor], centres), torch.inf
+                )
+            return clearance, gradient
+        clearance = self.clearance(centres, radii)
+        near = clearance < self.eps
+        gradient = torch.zeros_like(centres)
+        if near.any():  # most spheres are far from anything, and gradients cost more than distances
+            gradient[near] = self.field.distance_and_gradient(centres[near])[1].detach()
+        return clearance, gradient
 
     def _on_floor(
         self, floor_distance: Float[Tensor, "*batch floor"], centres: Float[Tensor, "*batch s 3"]

@@ -23,6 +23,7 @@ from robots.errors import (
 )
 from robots.inverse_kinematics import IkConfig, IkSolution
 from robots.kinematic_tree import KinematicTree
+from robots.link_pairs import PairConfig
 from robots.model import Gripper, Robot
 from robots.registry import available, load
 from robots.robot_fitting import RobotFitConfig, fit_robot
@@ -38,6 +39,7 @@ __all__ = [
     "IkConfig",
     "IkSolution",
     "KinematicTree",
+    "PairConfig",
     "PlanarBase",
     "Robot",
     "RobotError",

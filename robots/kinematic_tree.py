@@ -76,6 +76,7 @@ class KinematicTree:
                     raise UrdfError(
                         f"{path}: joint {joint.name!r} refers to link {link!r}, which is not there"
                     )
+        _check_mimics(joints, path)
         roots = [link for link in links if link not in children]
         if len(roots) != 1 or len(set(children)) != len(children):
             raise UrdfError(f"{path}: the links must form one tree; found {len(roots)} roots: {roots}")
@@ -116,6 +117,17 @@ class KinematicTree:
             if joint.child in bodies and above is not None:
                 pairs.add(frozenset((above, joint.child)))
         return frozenset(pairs)
+
+    def rigid_bodies(self, links: Collection[str]) -> list[tuple[str, ...]]:
+        """Some links, grouped by what fixed joints hold together, in the tree's order."""
+        body_of = {self.root: self.root}
+        groups: dict[str, list[str]] = {self.root: [self.root]}
+        for joint in self.joints:
+            body = joint.child if joint.movable else body_of[joint.parent]
+            body_of[joint.child] = body
+            groups.setdefault(body, []).append(joint.child)
+        kept = (tuple(link for link in group if link in links) for group in groups.values())
+        return [group for group in kept if group]
 
     def link_transforms(self, values: Mapping[str, float]) -> dict[str, np.ndarray]:
         """T_root_link (4, 4) of every link, float64, at the given joint values [rad | m] (0 where not given)."""
@@ -173,8 +185,7 @@ def parse_origin(element: ElementTree.Element | None) -> np.ndarray:
     """Transform (4, 4) of a URDF <origin> element, identity where it is absent."""
     if element is None:
         return np.eye(4)
-    xyz, rpy = (np.array(element.get(key, "0 0 0").split(), dtype=float) for key in ("xyz", "rpy"))
-    return pose_matrix(xyz, rpy)
+    return pose_matrix(*(_vector(element.get(key, "0 0 0"), f"<origin {key}>") for key in ("xyz", "rpy")))
 
 
 def _parse_joint(element: ElementTree.Element, path: str | Path) -> Joint:
@@ -187,7 +198,7 @@ def _parse_joint(element: ElementTree.Element, path: str | Path) -> Joint:
     axis_element, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
     axis = np.array([1.0, 0.0, 0.0])
     if axis_element is not None:
-        axis = np.array(axis_element.get("xyz", "1 0 0").split(), dtype=float)
+        axis = _vector(axis_element.get("xyz", "1 0 0"), f"{path}: <axis> of joint {name!r}")
     if kind != "fixed":
         if np.linalg.norm(axis) < 1e-9:
             raise UrdfError(f"{path}: joint {name!r} has a zero axis")
@@ -195,16 +206,16 @@ def _parse_joint(element: ElementTree.Element, path: str | Path) -> Joint:
     lower, upper, velocity = -math.inf, math.inf, None
     if limit is not None:
         if kind != "continuous":
-            lower, upper = float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))
-        velocity = float(limit.get("velocity", 0.0))
+            lower, upper = (_number(limit, key, 0.0, name, path) for key in ("lower", "upper"))
+        velocity = _number(limit, "velocity", 0.0, name, path)
     if lower > upper:
         raise UrdfError(f"{path}: joint {name!r} has lower limit {lower} above upper limit {upper}")
     follows = None
     if mimic is not None:
         follows = Mimic(
             _attribute(mimic, "joint", path),
-            float(mimic.get("multiplier", 1.0)),
-            float(mimic.get("offset", 0.0)),
+            _number(mimic, "multiplier", 1.0, name, path),
+            _number(mimic, "offset", 0.0, name, path),
         )
     parent, child = (end.get("link", "") for end in ends if end is not None)
     origin = parse_origin(element.find("origin"))
@@ -230,3 +241,50 @@ def _attribute(element: ElementTree.Element, key: str, path: str | Path) -> str:
     if not value:
         raise UrdfError(f"{path}: a <{element.tag}> element has no {key!r} attribute")
     return value
+
+
+def _check_mimics(joints: list[Joint], path: str | Path) -> None:
+    """Raise `UrdfError` where a name occurs twice, or a joint mimics one that is absent, fixed or follows it."""
+    by_name = {joint.name: joint for joint in joints}
+    if len(by_name) < len(joints):
+        names = [joint.name for joint in joints]
+        raise UrdfError(
+            f"{path}: joint names occur twice: {sorted({n for n in names if names.count(n) > 1})}"
+        )
+    for joint in joints:
+        seen, leader = [joint.name], joint
+        while leader.mimic is not None:
+            if leader.mimic.joint not in by_name or not by_name[leader.mimic.joint].movable:
+                movable = [other.name for other in joints if other.movable]
+                raise UrdfError(
+                    f"{path}: joint {leader.name!r} mimics {leader.mimic.joint!r}, which is no movable joint; "
+                    f"movable ones: {movable}"
+                )
+            leader = by_name[leader.mimic.joint]
+            if leader.name in seen:
+                raise UrdfError(f"{path}: joints mimic one another in a circle: {[*seen, leader.name]}")
+            seen.append(leader.name)
+
+
+def _number(element: ElementTree.Element, key: str, default: float, joint: str, path: str | Path) -> float:
+    text = element.get(key)
+    try:
+        value = default if text is None else float(text)
+    except ValueError as error:
+        raise UrdfError(
+            f"{path}: <{element.tag} {key}={text!r}> of joint {joint!r} is not a number"
+        ) from error
+    if math.isnan(value):
+        raise UrdfError(f"{path}: <{element.tag} {key}> of joint {joint!r} is NaN")
+    return value
+
+
+def _vector(text: str, where: str) -> np.ndarray:
+    """Three finite numbers (3,); raises `UrdfError`."""
+    try:
+        vector = np.array(text.split(), dtype=float)
+    except ValueError:
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise UrdfError(f"{where} is {text!r}; expected three numbers")
+    return vector

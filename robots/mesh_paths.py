@@ -13,16 +13,24 @@ from robots.errors import RobotError, UrdfError
 
 def example_robot_data() -> Path:
     """Folder `robots/` of the installed example-robot-data package; raises `RobotError` where it is absent."""
+    manifest = installed_file("example-robot-data", "example-robot-data/package.xml", extra="robots")
+    return manifest.parent / "robots"
+
+
+def installed_file(package: str, ending: str, extra: str) -> Path:
+    """The file of an installed package whose path ends like this.
+
+    Raises `RobotError`, with the `extra` of this project to install, where there is no such package or file.
+    """
+    fix = f"fix: pip install {package}, or 'isdf-planning[{extra}]'"
     try:
-        files = importlib.metadata.files("example-robot-data") or []
+        files = importlib.metadata.files(package) or []
     except importlib.metadata.PackageNotFoundError as error:
-        raise RobotError(
-            "the package example-robot-data is not installed; fix: pip install example-robot-data"
-        ) from error
+        raise RobotError(f"the package {package} is not installed; {fix}") from error
     for file in files:
-        if file.parts[-2:] == ("example-robot-data", "package.xml"):
-            return Path(str(file.locate())).resolve().parent / "robots"
-    raise RobotError("example-robot-data is installed without its share folder; reinstall it")
+        if f"/{file.as_posix()}".endswith(f"/{ending}"):
+            return Path(str(file.locate())).resolve()
+    raise RobotError(f"the installed package {package} has no file {ending}; {fix}")
 
 
 def resolve_mesh(uri: str, urdf_path: str | Path) -> Path:

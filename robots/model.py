@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from robots.errors import RobotError, UnknownJointError
+from robots.errors import RobotError, SphereFileError, UnknownJointError
+from robots.fine_cover import fine_cover
+from robots.joint_chain import JointChain, joint_chain
 from robots.kinematic_tree import KinematicTree
 from robots.moving_frames import MovingFrames
 from robots.spheres import SphereSet, load_spheres
@@ -176,6 +180,36 @@ class Robot:
         """Pairs of sphere indices that can move against each other and must not touch."""
         return self._pairs
 
+    @cached_property
+    def chain(self) -> JointChain:
+        """The moving joints as arrays."""
+        return joint_chain(self._frames)
+
+    @property
+    def placed_spheres(self) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 4"]]:
+        """Of each sphere the moving frame that carries it, and its centre there with its radius [m]."""
+        return self._placed
+
+    def fine_spheres(self) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m 4"], Int[np.ndarray, " m"]]:
+        """Of a much finer cover of the links that have spheres: moving frame, centre there with radius [m], link.
+
+        Links are numbered as in `link_pairs`. The first use of a geometry takes seconds; then it is cached.
+        """
+        return self._fine_spheres
+
+    @cached_property
+    def _fine_spheres(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        links = tuple(self.sphere_set.spheres)
+        cover = fine_cover(self.urdf_path)
+        balls = {link: cover.get(link, rows) for link, rows in self.sphere_set.spheres.items()}
+        frame, placed = _place_spheres(SphereSet(balls), self._frames)
+        return frame, placed, np.repeat(np.arange(len(links)), [len(balls[link]) for link in links])
+
+    @property
+    def link_pairs(self) -> Int[np.ndarray, "pairs 2"]:
+        """Pairs of links, by their place among those with spheres, that must not touch."""
+        return _link_pairs(self.tree, self.sphere_set, self._frames)
+
     @property
     def floor_spheres(self) -> Bool[Tensor, " spheres"]:
         """Which spheres belong to links that drive on the floor."""
@@ -234,6 +268,11 @@ class Robot:
             values.update(zip(self.head_joints, map(float, head), strict=True))
         return self.tree.link_transforms(values)[self.camera_link]
 
+    @property
+    def holdable_joints(self) -> tuple[str, ...]:
+        """Joints that `with_fixed` accepts: all that have a value of their own."""
+        return self.tree.movable_joints
+
     def with_fixed(self, values: Mapping[str, float]) -> Robot:
         """A robot that holds these joints [rad | m] and plans the rest, e.g. the arm of a parked base.
 
@@ -244,12 +283,27 @@ class Robot:
         if unknown:
             raise UnknownJointError(f"cannot fix {unknown}; joints that can be held: {allowed}")
         joints = tuple(joint for joint in self._joints if joint not in values)
+        return self._changed(
+            joints=joints, held={**self.held, **{name: float(value) for name, value in values.items()}}
+        )
+
+    def with_spheres(self, spheres: SphereSet | str | Path) -> Robot:
+        """The same robot covered by another sphere set; raises `SphereFileError` and `UnknownLinkError`."""
+        return self._changed(sphere_set=spheres if isinstance(spheres, SphereSet) else load_spheres(spheres))
+
+    def _changed(
+        self,
+        *,
+        sphere_set: SphereSet | None = None,
+        joints: Sequence[str] | None = None,
+        held: Mapping[str, float] | None = None,
+    ) -> Robot:
         return Robot(
             self.tree,
-            self.sphere_set,
+            self.sphere_set if sphere_set is None else sphere_set,
             urdf_path=self.urdf_path,
-            joints=joints,
-            held={**self.held, **{name: float(value) for name, value in values.items()}},
+            joints=self._joints if joints is None else joints,
+            held=self.held if held is None else held,
             named=self._named,
             tool_link=self.tool_link,
             gripper=self.gripper,
@@ -272,6 +326,8 @@ class Robot:
         for link in filter(None, (self.tool_link, self.camera_link)):
             self.tree.require_link(link)
         self.sphere_set.check_links(self.tree.links)
+        if len(self.sphere_set) == 0:
+            raise SphereFileError(f"{self.name!r} has no collision sphere; give at least one")
 
     def _checked(self, q: Tensor) -> Tensor:
         if q.ndim == 0 or q.shape[-1] != self.num_dofs:
@@ -318,14 +374,22 @@ def _place_spheres(sphere_set: SphereSet, frames: MovingFrames) -> tuple[np.ndar
 
 
 def _sphere_pairs(tree: KinematicTree, sphere_set: SphereSet, frames: MovingFrames) -> Tensor:
-    """Pairs of spheres of links that move against each other, are not neighbours and are not ignored."""
-    ignored = sphere_set.ignored_pairs | tree.neighbours(sphere_set.spheres)
-    names = tuple(sphere_set.spheres)
+    """Pairs of spheres of links that must not touch."""
     first = np.cumsum([0, *(len(rows) for rows in sphere_set.spheres.values())])
     pairs = []
-    for a, name in enumerate(names):
-        for b in range(a + 1, len(names)):
-            if frozenset((name, names[b])) in ignored or frames.place(name)[0] == frames.place(names[b])[0]:
-                continue
-            pairs += [(i, j) for i in range(first[a], first[a + 1]) for j in range(first[b], first[b + 1])]
+    for a, b in _link_pairs(tree, sphere_set, frames):
+        pairs += [(i, j) for i in range(first[a], first[a + 1]) for j in range(first[b], first[b + 1])]
     return torch.tensor(pairs, dtype=torch.long).reshape(-1, 2)
+
+
+def _link_pairs(tree: KinematicTree, sphere_set: SphereSet, frames: MovingFrames) -> np.ndarray:
+    """Pairs (p, 2) of links that move against each other, are not neighbours and are not ignored."""
+    ignored = sphere_set.ignored_pairs | tree.neighbours(sphere_set.spheres)
+    names = tuple(sphere_set.spheres)
+    pairs = [
+        (a, b)
+        for a, b in itertools.combinations(range(len(names)), 2)
+        if frozenset((names[a], names[b])) not in ignored
+        and frames.place(names[a])[0] != frames.place(names[b])[0]
+    ]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)

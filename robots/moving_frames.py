@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pytorch_kinematics
@@ -12,6 +13,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from robots.kinematic_tree import Joint, KinematicTree, roll_pitch_yaw
+
+
+@dataclass(frozen=True)
+class Move:
+    """A joint that moves a frame: the frame it stands on, its origin (4, 4) there, and what drives it.
+
+    `source` is the column of q, the multiplier and the offset.
+    """
+
+    joint: Joint
+    parent: int
+    origin: np.ndarray
+    source: tuple[int, float, float]
 
 
 class MovingFrames:
@@ -23,9 +37,7 @@ class MovingFrames:
     """
 
     def __init__(self, tree: KinematicTree, joints: Sequence[str], held: Mapping[str, float]) -> None:
-        self._source: list[
-            tuple[int, float, float]
-        ] = []  # column of q, multiplier, offset of each moving joint
+        self.moves: list[Move] = []  # joint i moves frame i + 1
         self._places: dict[str, tuple[int, np.ndarray]] = {tree.root: (0, np.eye(4))}
         robot = ElementTree.Element("robot", name="moving_frames")
         ElementTree.SubElement(robot, "link", name="frame_0")
@@ -36,9 +48,9 @@ class MovingFrames:
                 motion = joint.motion(tree.value_of(joint, held))
                 self._places[joint.child] = (frame, offset @ joint.origin @ motion)
                 continue
-            self._source.append(source)
-            self._places[joint.child] = (len(self._source), np.eye(4))
-            _append_joint(robot, joint, frame, len(self._source), offset @ joint.origin)
+            self.moves.append(Move(joint, frame, offset @ joint.origin, source))
+            self._places[joint.child] = (len(self.moves), np.eye(4))
+            _append_joint(robot, joint, frame, len(self.moves), offset @ joint.origin)
         self._urdf = ElementTree.tostring(robot, encoding="unicode")
         self._compiled: dict[tuple[torch.dtype, torch.device], tuple[pytorch_kinematics.Chain, ...]] = {}
 
@@ -57,8 +69,10 @@ class MovingFrames:
         if key not in self._compiled:
             chain = pytorch_kinematics.build_chain_from_urdf(self._urdf).to(dtype=q.dtype, device=q.device)
             numbers = [int(name.removeprefix("joint_")) for name in chain.get_joint_parameter_names()]
-            column, multiplier, offset = zip(*(self._source[number - 1] for number in numbers), strict=True)
-            frames = [chain.frame_to_idx[f"frame_{i}"] for i in range(len(self._source) + 1)]
+            column, multiplier, offset = zip(
+                *(self.moves[number - 1].source for number in numbers), strict=True
+            )
+            frames = [chain.frame_to_idx[f"frame_{i}"] for i in range(len(self.moves) + 1)]
             self._compiled[key] = (
                 chain,
                 torch.tensor(frames, device=q.device),

@@ -3,35 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 import trimesh
-from torch import Tensor
 
+from robots.convex_shape import Shape
 from robots.errors import RobotError, UnknownLinkError
 from robots.kinematic_tree import KinematicTree
 from robots.link_geometry import collision_pieces
+from robots.link_pairs import PairConfig, untested_pairs
 from robots.model import Robot
-from robots.sphere_fitting import BallCover, Shape, SphereFit
+from robots.sphere_fitting import GrowingCover, SphereFit
 from robots.spheres import SphereSet
 
 
 @dataclass(frozen=True)
 class RobotFitConfig:
-    """How spheres are shared out among bodies, and how unneeded self-collision pairs are found."""
+    """How spheres are shared out among bodies; `pairs`: how unneeded self-collision pairs are found."""
 
     # Bodies of this size and above get the full overshoot, smaller ones (size / coarse_size) ** size_exponent
     # of it: a palm wants finer spheres than a base.
     coarse_size: float = 0.5  # [m] diagonal of the bounding box
-    size_exponent: float = 0.75
-    pair_samples: int = 10_000  # random configurations behind the never/always rule
-    near_samples: int = 100  # of these, the closest ones of a pair on which the real geometry is compared
-    never_margin: float = 0.01  # [m] a pair counts as never colliding only if it stays this far apart
-    always_share: float = 0.95  # a pair in collision this often is an artefact of overlapping spheres
+    size_exponent: float = 0.6
+    # The body that never moves collides with nothing but the robot itself; it gets this multiple.
+    static_factor: float = 2.0
+    gap: float = 0.001  # [m] that geometry may stand out of the spheres: it spares many at edges and corners
     seed: int = 0
+    pairs: PairConfig = field(default_factory=PairConfig)
 
 
 def fit_robot(
@@ -72,19 +72,20 @@ def fit_robot(
             f"{sorted(unknown)} have no collision geometry; links that do: {tuple(pieces)}"
         )
     bodies = [
-        _Body(tree, links, pieces, lowest, config) for links in _rigid_bodies(tree, set(pieces) - set(skip))
+        _Body(tree, links, pieces, lowest, config) for links in tree.rigid_bodies(set(pieces) - set(skip))
     ]
-    overshoot = _overshoot_within(bodies, budget)
+    if not bodies:
+        raise RobotError(f"{urdf}: no link has collision geometry to cover (after skipping {sorted(skip)})")
+    _share_out(bodies, budget)
     rows: dict[str, np.ndarray] = {}
     report = {}
     for body in bodies:
-        fit = body.cover.fit(overshoot * body.scale)
-        report[body.links[0]] = fit
+        report[body.links[0]] = fit = body.cover.fit()
         rows.update(body.spheres_by_link(fit.spheres))
     spheres = SphereSet(rows, floor_links=frozenset(floor_links) & set(rows))
     robot = Robot.from_urdf(urdf, spheres)
     known = frozenset(frozenset(pair) for pair in ignored_pairs)
-    return replace(spheres, ignored_pairs=known | untested_pairs(robot, config)), report
+    return replace(spheres, ignored_pairs=known | untested_pairs(robot, config.pairs)), report
 
 
 class _Body:
@@ -106,8 +107,15 @@ class _Body:
         self._shapes = {link: Shape(parts, config.seed) for link, parts in moved.items()}
         whole = Shape([piece for parts in moved.values() for piece in parts], config.seed)
         heights = [self._places[link][2, 3] + lowest[link] for link in links if link in lowest]
-        self.cover = BallCover(whole, max(heights) if heights else None)
-        self.scale = min(1.0, whole.size / config.coarse_size) ** config.size_exponent
+        self.cover = GrowingCover(whole, max(heights) if heights else None, config.gap)
+        self._scale = min(1.0, whole.size / config.coarse_size) ** config.size_exponent
+        if tree.root in links:
+            self._scale *= config.static_factor
+
+    @property
+    def excess(self) -> float:
+        """Overshoot [m] of the body so far, in proportion to what a body of its size may have."""
+        return self.cover.overshoot / self._scale
 
     def spheres_by_link(self, spheres: np.ndarray) -> dict[str, np.ndarray]:
         """Spheres (n, 4) of the body, each in the frame of the link that its centre lies deepest in."""
@@ -123,89 +131,14 @@ class _Body:
         return shared
 
 
-def _rigid_bodies(tree: KinematicTree, links: Collection[str]) -> list[tuple[str, ...]]:
-    """The links grouped by what fixed joints hold together, in the tree's order."""
-    body_of = {tree.root: tree.root}
-    groups: dict[str, list[str]] = {tree.root: [tree.root]}
-    for joint in tree.joints:
-        body = joint.child if joint.movable else body_of[joint.parent]
-        body_of[joint.child] = body
-        groups.setdefault(body, []).append(joint.child)
-    kept = (tuple(link for link in group if link in links) for group in groups.values())
-    return [group for group in kept if group]
-
-
-def untested_pairs(robot: Robot, config: RobotFitConfig | None = None) -> frozenset[frozenset[str]]:
-    """Link pairs that need no self-collision test: neighbours, and pairs that never or (almost) always touch.
-
-    Judged on random configurations within the joint limits (unlimited joints: half a turn either way), as
-    set-up tools for motion planners do. Where only the spheres touch, the collision geometry itself decides.
-    """
-    config = config or RobotFitConfig()
-    links = tuple(robot.sphere_set.spheres)
-    lower, upper = robot.joint_limits.clamp(-torch.pi, torch.pi).unbind(-1)
-    generator = torch.Generator().manual_seed(config.seed)
-    q = lower + (upper - lower) * torch.rand(config.pair_samples, robot.num_dofs, generator=generator)
-    gaps = torch.cat([_link_gaps(robot, part, links) for part in q.split(500)])
-    always = (gaps <= 0).float().mean(0) >= config.always_share
-    pieces = collision_pieces(robot.urdf_path)
-    shapes = {link: Shape(pieces[link], config.seed) for link in links if link in pieces}
-    untested = set(robot.tree.neighbours(links))
-    for a, first in enumerate(links):
-        for b in range(a + 1, len(links)):
-            pair = frozenset((first, links[b]))
-            nearest = gaps[:, a, b].topk(min(config.near_samples, len(q)), largest=False)
-            if pair in untested:
-                continue
-            never = bool(nearest.values[0] > config.never_margin)
-            if not never and not always[a, b] and pair <= set(shapes):
-                never = (
-                    _geometry_gap(robot, q[nearest.indices], first, links[b], shapes) > config.never_margin
-                )
-            if never or always[a, b]:
-                untested.add(pair)
-    return frozenset(untested)
-
-
-def _geometry_gap(robot: Robot, q: Tensor, first: str, second: str, shapes: Mapping[str, Shape]) -> float:
-    """Least distance [m] between surface samples of two links over some configurations (n, dof)."""
-    poses = robot.link_poses(q.double(), [first, second]).numpy()
-    gap = float("inf")
-    for a, b, inner, outer in ((0, 1, first, second), (1, 0, second, first)):
-        points = shapes[inner].surface_points(300)
-        relative = np.linalg.inv(poses[:, b]) @ poses[:, a]
-        moved = points @ relative[:, :3, :3].transpose(0, 2, 1) + relative[:, None, :3, 3]
-        gap = min(gap, float(shapes[outer].signed_distance(moved.reshape(-1, 3)).min()))
-    return gap
-
-
-def _link_gaps(robot: Robot, q: Tensor, links: tuple[str, ...]) -> Tensor:
-    """Least distance (n, l, l) [m] between the spheres of each two links at configurations (n, dof)."""
-    centres, radii = robot.spheres(q)
-    counts = [len(robot.sphere_set.spheres[link]) for link in links]
-    gaps = torch.cdist(centres, centres) - radii[:, None] - radii
-    rows = torch.stack([part.amin(1) for part in gaps.split(counts, dim=1)], dim=1)
-    return torch.stack([part.amin(2) for part in rows.split(counts, dim=2)], dim=2)
-
-
-def _overshoot_within(bodies: Sequence[_Body], budget: int) -> float:
-    """Smallest common overshoot [m] that keeps the sum of all covers within the budget (bisection)."""
-
-    def count(overshoot: float) -> float:
-        total = 0.0
-        for body in bodies:
-            chosen = body.cover.choose(overshoot * body.scale)
-            total += float("inf") if chosen is None else len(chosen)
-            if total > budget:
-                break
-        return total
-
-    low, high = 0.0, max(body.cover.shape.size / body.scale for body in bodies)
-    if count(high) > budget:
+def _share_out(bodies: Sequence[_Body], budget: int) -> None:
+    """Give each further ball to the body that is covered worst for its size."""
+    if budget < len(bodies):
         raise RobotError(
-            f"{budget} spheres do not cover {len(bodies)} bodies; give more, or a lower `lowest`"
+            f"{budget} spheres do not cover {len(bodies)} bodies that move against each other; give more"
         )
-    while high - low > 2e-4:
-        middle = (low + high) / 2
-        low, high = (low, middle) if count(middle) <= budget else (middle, high)
-    return high
+    for _ in range(budget - len(bodies)):
+        growing = [body for body in bodies if not body.cover.stalled]
+        if not growing:
+            return
+        max(growing, key=lambda body: body.excess).cover.add()

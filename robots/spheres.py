@@ -70,7 +70,9 @@ def load_spheres(path: str | Path) -> SphereSet:
     negative radius, cuRobo's mark for "switched off", are skipped. Raises `SphereFileError`.
     """
     content = _read_yaml(path)
-    section = content.get("robot_cfg", {}).get("kinematics", content)
+    section = content
+    for key in ("robot_cfg", "kinematics"):
+        section = section[key] if isinstance(section.get(key), dict) else section
     spheres = section.get("collision_spheres")
     if isinstance(spheres, str):
         spheres = _read_yaml(Path(path).parent / spheres).get("collision_spheres")
@@ -80,7 +82,15 @@ def load_spheres(path: str | Path) -> SphereSet:
             "or under robot_cfg.kinematics"
         )
     rows = {link: _rows(entries, link, path) for link, entries in spheres.items()}
+    if not any(len(found) for found in rows.values()):
+        raise SphereFileError(
+            f"{path}: there is no sphere in it (links: {sorted(rows)}); a robot needs at least one"
+        )
     ignore = section.get("self_collision_ignore") or {}
+    if not isinstance(ignore, dict) or not all(isinstance(others, list) for others in ignore.values()):
+        raise SphereFileError(
+            f"{path}: self_collision_ignore must map a link to a list of links, got {ignore!r}"
+        )
     pairs = frozenset(frozenset((a, b)) for a, others in ignore.items() for b in others)
     floor = frozenset(section.get("floor_links") or ())
     return SphereSet({link: r for link, r in rows.items() if len(r)}, pairs, floor)
@@ -119,6 +129,8 @@ def _read_yaml(path: str | Path) -> dict[str, Any]:
 
 def _rows(entries: Any, link: str, path: str | Path) -> np.ndarray:
     rows = []
+    if not isinstance(entries or [], list):
+        raise SphereFileError(f"{path}: spheres of link {link!r} must be a list, got {entries!r}")
     for entry in entries or ():
         try:
             x, y, z = (float(value) for value in entry["center"])

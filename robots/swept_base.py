@@ -11,7 +11,6 @@ from torch import Tensor
 
 from robots.errors import RobotError, UnknownJointError
 from robots.model import Robot
-from robots.sphere_fitting import greedy_cover
 from robots.urdf import BASE_JOINTS
 
 
@@ -141,3 +140,27 @@ def _nearest_sphere(spheres: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Index (n,) of the robot's sphere whose swept ring a sphere of the sweep lies deepest in."""
     flat, discs = (np.column_stack([np.hypot(s[:, 0], s[:, 1]), s[:, 2]]) for s in (spheres, rows))
     return (cdist(flat, discs) - rows[:, 3]).argmin(1)
+
+
+def greedy_cover(contains: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Columns of a boolean matrix (points, sets) that together contain every point, redundant ones removed.
+
+    Each step takes the set with the greatest `gain` (per set) times the number of points it newly contains.
+    """
+    counts = contains.sum(0, dtype=np.int32)
+    uncovered = np.ones(len(contains), dtype=bool)
+    chosen: list[int] = []
+    while uncovered.any():
+        best = int(np.argmax(counts * gain))
+        newly = contains[:, best] & uncovered
+        chosen.append(best)
+        counts -= contains[newly].sum(0, dtype=np.int32)
+        uncovered &= ~newly
+    times = contains[:, chosen].sum(1)
+    kept = []
+    for ball in chosen:
+        if (times[contains[:, ball]] > 1).all():
+            times = times - contains[:, ball]
+        else:
+            kept.append(ball)
+    return np.array(kept)

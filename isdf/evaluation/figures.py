@@ -34,26 +34,21 @@ def save_curves(
         dpi: of the picture.
     """
     columns = max(len(row) for row in panels.values())
+    names = list(dict.fromkeys(m for row in panels.values() for methods in row.values() for m in methods))
+    colours = {name: f"C{number}" for number, name in enumerate(names)}
     figure = Figure(figsize=(max(7.0, 2.7 * columns), 2.2 * len(panels) + 0.4), layout="constrained")
     axes = figure.subplots(len(panels), columns, squeeze=False, sharey="row")
     for row, (label, sequences) in zip(axes, panels.items(), strict=True):
         row[0].set_ylabel(label)
         for ax, (sequence, methods) in zip(row, sequences.items(), strict=False):
-            for number, (_, runs) in enumerate(methods.items()):
-                _curve(ax, runs, f"C{number}")
+            for name, runs in methods.items():
+                _curve(ax, runs, colours[name])
             ax.set_title(sequence if ax in axes[0] else "", fontsize=10)
-            ax.set_ylim(bottom=0)
+            ax.set_xlabel("time [s]" if ax in axes[-1] else "")
             ax.grid(alpha=0.3)
-            if ax in axes[-1]:
-                ax.set_xlabel("time [s]")
-    first = next(iter(panels.values()))
-    labels = list(next(iter(first.values())))
-    figure.legend(
-        [axes[0, 0].plot([], [], color=f"C{i}")[0] for i in range(len(labels))],
-        labels,
-        loc="outside lower center",
-        ncols=len(labels),
-    )
+        row[0].set_ylim(bottom=0)  # last: it ends the scaling to what is drawn
+    lines = [axes[0, 0].plot([], [], color=colour)[0] for colour in colours.values()]
+    figure.legend(lines, names, loc="outside lower center", ncols=len(names))
     save_small(figure, path, dpi)
 
 

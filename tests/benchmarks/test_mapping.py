@@ -235,7 +235,7 @@ def test_tables_average_over_sequences_and_spread_over_seeds() -> None:
 def test_the_report_draws_everything_and_publishes_between_marks(recorded, tmp_path, monkeypatch) -> None:
     methods = {"isdf": SMALL, "exact": ExactConfig(voxel=0.08)}
     monkeypatch.setattr(experiments, "METHODS", methods)
-    run_options = options(recorded, tmp_path, experiments=("main",), methods=(), seeds=(0, 1))
+    run_options = options(recorded, tmp_path, experiments=("main",), methods=())
     assert mapping.main(run_options) == []
     page = tmp_path / "docs" / "results.md"
     page.parent.mkdir()

@@ -8,6 +8,7 @@ from planning import (
     Chomp,
     ChompConfig,
     ConfigError,
+    DescentConfig,
     MetricConfig,
     ObjectiveConfig,
     Status,
@@ -106,7 +107,9 @@ def test_rotating_the_world_rotates_the_path():
     angle = torch.tensor(0.7)
     turn = torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
     goal, pole = torch.tensor([2.0, 0.0]), torch.tensor([1.0, 0.1])
-    config = ChompConfig(perturbation=1e-9, max_update=10.0)  # the cap is a joint's own and so not invariant
+    config = ChompConfig(
+        perturbation=1e-9, descent=DescentConfig(max_update=10.0)
+    )  # the cap is a joint's own and so not invariant
     plain = Chomp(Disc(), config).optimise(
         _line([0.0, 0.0], goal.tolist()), Cylinder(tuple(pole.tolist()), 0.3)
     )
@@ -156,7 +159,9 @@ def test_poles_between_waypoints_are_seen_in_the_end():
     line = _line([0.0, 0.0], [2.0, 0.0], 5)
     result = Chomp(Disc(0.02)).optimise(line, Cylinder((0.75, 0.005), 0.03))
     assert result.success, result.message
-    unaided = Chomp(Disc(0.02), ChompConfig(max_tightenings=0)).optimise(line, Cylinder((0.75, 0.005), 0.03))
+    unaided = Chomp(Disc(0.02), ChompConfig(max_tightenings=0, restarts=0)).optimise(
+        line, Cylinder((0.75, 0.005), 0.03)
+    )
     assert unaided.status is Status.COLLISION
 
 
@@ -201,7 +206,7 @@ def test_deadline_is_kept():
             return super().distance_and_gradient(points)
 
     walls = Slow((1.0, 0.0), 0.95)
-    result = Chomp(Disc(0.02), ChompConfig(tolerance=0.0)).optimise(
+    result = Chomp(Disc(0.02), ChompConfig(descent=DescentConfig(tolerance=0.0))).optimise(
         _line([0.0, 0.0], [2.0, 0.0]), walls, deadline=0.3
     )
     assert result.seconds < 0.6 and 0 < result.iterations < 20

@@ -29,10 +29,10 @@ def test_smoothness_gradient(config):
 @pytest.mark.parametrize("config", CONFIGS)
 def test_smoothness_ignores_where_and_grows_with_the_square(config):
     metric, q = Metric(12, config), torch.rand(12, 3, dtype=torch.float64)
-    value = metric.smoothness(q)[0]
-    assert metric.smoothness(q + 7.0)[0] == pytest.approx(value, rel=1e-6)
-    assert metric.smoothness(3 * q)[0] == pytest.approx(9 * value, rel=1e-9)
-    assert metric.smoothness(q.flip(0))[0] == pytest.approx(value, rel=1e-6)
+    value = float(metric.smoothness(q)[0])
+    assert float(metric.smoothness(q + 7.0)[0]) == pytest.approx(value, rel=1e-6)
+    assert float(metric.smoothness(3 * q)[0]) == pytest.approx(9 * value, rel=1e-9)
+    assert float(metric.smoothness(q.flip(0))[0]) == pytest.approx(value, rel=1e-6)
 
 
 @pytest.mark.parametrize("config", CONFIGS)
@@ -47,9 +47,8 @@ def test_smoothness_of_one_motion_does_not_depend_on_the_number_of_waypoints():
     values = []
     for n in (51, 201):
         t = torch.linspace(0, 1, n, dtype=torch.float64)
-        values.append(
-            Metric(n, MetricConfig(1.0, 0.0, 0.0)).smoothness((3.0 * t * t * (1 - t) ** 2)[:, None])[0]
-        )
+        metric = Metric(n, MetricConfig(1.0, 0.0, 0.0))
+        values.append(float(metric.smoothness((3.0 * t * t * (1 - t) ** 2)[:, None])[0]))
     assert values[0] == pytest.approx(values[1], rel=2e-2)
 
 

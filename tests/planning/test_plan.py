@@ -25,7 +25,9 @@ def test_a_trap_is_left_with_the_help_of_the_search(field):
 
 def test_the_searched_path_is_returned_where_chomp_may_not_iterate():
     start, goal = torch.tensor([1.0, 0.0]), torch.tensor([4.0, 0.5])
-    config = PlannerConfig(num_waypoints=8, chomp=ChompConfig(max_iterations=0, max_tightenings=0))
+    config = PlannerConfig(
+        num_waypoints=8, chomp=ChompConfig(max_iterations=0, max_tightenings=0, restarts=0)
+    )
     result = Planner(Disc(), config).plan(start, goal, TRAP)
     assert result.success and "not optimised" in result.message
     assert check(Disc(), result.trajectory, TRAP).success

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import math
 
 import numpy as np
@@ -14,7 +15,7 @@ from robots.kinematic_tree import KinematicTree
 from tests.gradients import assert_gradient_matches
 
 
-@pytest.fixture(scope="module", params=["tiago", "panda"])
+@pytest.fixture(scope="module", params=["tiago", "panda", "ur5"])
 def robot(request: pytest.FixtureRequest) -> robots.Robot:
     return robots.load(request.param)
 
@@ -156,7 +157,7 @@ def test_with_fixed_gives_the_same_spheres(tiago: robots.Robot) -> None:
 
 def test_self_collision_pairs_are_sound(robot: robots.Robot) -> None:
     pairs = robot.self_collision_pairs
-    assert 0 < len(pairs) < 1500
+    assert 0 < len(pairs) < 15_000
     neighbours = robot.tree.neighbours(robot.sphere_set.spheres)
     for i, j in pairs.tolist():
         names = frozenset((robot.sphere_links[i], robot.sphere_links[j]))
@@ -215,7 +216,7 @@ def test_unknown_names_are_answered_with_the_valid_ones(tiago: robots.Robot) -> 
         tiago.link_poses(tiago.rest, ["elbow"])
     with pytest.raises(robots.UnknownJointError, match="arm_3_joint"):
         tiago.with_fixed({"elbow": 0.0})
-    with pytest.raises(robots.UnknownRobotError, match="panda, tiago"):
+    with pytest.raises(robots.UnknownRobotError, match="fetch, panda, tiago, ur5"):
         robots.load("r2d2")
 
 
@@ -248,3 +249,32 @@ def test_mimicking_joints_follow(tmp_path) -> None:
     assert robot.joint_names == ("lead",)
     assert robot.spheres(torch.tensor([0.3]))[0][0].tolist() == pytest.approx([0, 0, 0.5 - 0.6])
     assert KinematicTree.from_urdf(urdf).movable_joints == ("lead",)
+
+
+def test_the_fetch_has_motionbenchmakers_joint_order() -> None:
+    try:
+        fetch = robots.load("fetch")
+    except robots.RobotError as error:
+        pytest.skip(f"no Fetch: {error}")
+    arm = (
+        "shoulder_pan",
+        "shoulder_lift",
+        "upperarm_roll",
+        "elbow_flex",
+        "forearm_roll",
+        "wrist_flex",
+        "wrist_roll",
+    )
+    assert fetch.joint_names == ("torso_lift_joint", *(f"{joint}_joint" for joint in arm))
+    q = random_configurations(fetch, 1)[0]
+    links = tuple(link for link in fetch.tree.links if link != fetch.tree.root)
+    assert np.abs(fetch.link_poses(q, links).numpy() - pybullet_poses(fetch, q, links)).max() < 1e-4
+
+
+def test_a_missing_robot_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "files", missing)
+    with pytest.raises(robots.RobotError, match=r"fetch-planning is not installed.*isdf-planning\[fetch\]"):
+        robots.load("fetch")

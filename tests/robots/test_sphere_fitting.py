@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 import robots
-from robots.sphere_fitting import SphereFit, greedy_cover
+from robots.sphere_fitting import SphereFit
 
 BOX = trimesh.creation.box((0.3, 0.2, 0.1))
 CYLINDER = trimesh.creation.cylinder(radius=0.1, height=0.3, sections=24)
@@ -70,16 +70,6 @@ def test_impossible_requests_are_refused() -> None:
         robots.fit_spheres(BOX, 4, lowest=0.0)  # half of the box is below
 
 
-def test_greedy_cover_covers_without_redundancy() -> None:
-    rng = np.random.default_rng(0)
-    contains = rng.random((200, 40)) < 0.2
-    contains[:, 0] |= ~contains.any(1)
-    chosen = greedy_cover(contains, np.ones(40))
-    assert contains[:, chosen].any(1).all()
-    for left_out in range(len(chosen)):
-        assert not contains[:, np.delete(chosen, left_out)].any(1).all()
-
-
 def test_a_whole_robot_is_covered(tmp_path) -> None:
     urdf = tmp_path / "r.urdf"
     link = '<link name="{0}"><collision><origin xyz="{2}"/><geometry>{1}</geometry></collision></link>'
@@ -107,7 +97,7 @@ def test_a_whole_robot_is_covered(tmp_path) -> None:
         skip=["wheel"],
         lowest={"base": -0.025},
         floor_links=["base"],
-        config=robots.RobotFitConfig(pair_samples=500),
+        config=robots.RobotFitConfig(pairs=robots.PairConfig(samples=500)),
     )
     assert len(spheres) <= 40
     assert set(report) == {"base", "upper", "lower"}  # the cap is fixed to the base: one body

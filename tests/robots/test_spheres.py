@@ -52,6 +52,15 @@ def test_spheres_in_a_second_file(tmp_path: Path) -> None:
     [
         ("[1, 2]", "mapping"),
         ("a: 1", "collision_spheres"),
+        ("", "mapping"),
+        ("collision_spheres: {}", "collision_spheres"),
+        ("collision_spheres: {a: [], b: []}", "no sphere in it"),
+        ("collision_spheres: {a: 3}", "list"),
+        ("robot_cfg: 3", "collision_spheres"),
+        (
+            "collision_spheres: {a: [{center: [0, 0, 0], radius: 1}]}\nself_collision_ignore: [a]",
+            "self_collision_ignore",
+        ),
         ("a: [", "valid YAML"),
         ("collision_spheres:\n  a: [{center: [0, 0], radius: 1}]", "center"),
         ("collision_spheres:\n  a: [{radius: 1}]", "center"),
@@ -71,7 +80,9 @@ def test_missing_file_and_unknown_links(tmp_path: Path) -> None:
     with pytest.raises(robots.SphereFileError, match=r"nothing\.yaml"):
         robots.load_spheres(tmp_path / "nothing.yaml")
     panda = robots.load("panda")
-    with pytest.raises(robots.UnknownLinkError, match="elbow"):
+    with pytest.raises(robots.SphereFileError, match="no collision sphere"):
+        panda.with_spheres(robots.SphereSet({}))
+    with pytest.raises(robots.UnknownLinkError, match=r"elbow.*panda_link3"):
         robots.Robot.from_urdf(panda.urdf_path, robots.SphereSet({"elbow": SPHERES["a"]}))
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 import robots
+from robots.swept_base import greedy_cover
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +65,13 @@ def test_bad_requests_are_refused(tiago: robots.Robot) -> None:
         swept.spheres(torch.zeros(3))
     with pytest.raises(robots.RobotError, match="NaN"):
         swept.spheres(torch.tensor([0.0, torch.nan]))
+
+
+def test_greedy_cover_covers_without_redundancy() -> None:
+    rng = np.random.default_rng(0)
+    contains = rng.random((200, 40)) < 0.2
+    contains[:, 0] |= ~contains.any(1)
+    chosen = greedy_cover(contains, np.ones(40))
+    assert contains[:, chosen].any(1).all()
+    for left_out in range(len(chosen)):
+        assert not contains[:, np.delete(chosen, left_out)].any(1).all()

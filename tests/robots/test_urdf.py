@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import os
 import stat
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 import robots
 from robots.kinematic_tree import KinematicTree
@@ -128,6 +131,11 @@ def test_mesh_uris_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         (ARM.replace('type="revolute"', 'type="floating"'), "floating"),
         (ARM.replace('xyz="0 0 1"', 'xyz="0 0 0"'), "zero axis"),
         (ARM.replace('lower="-1"', 'lower="2"'), "above upper"),
+        (ARM.replace('lower="-1"', 'lower="one"'), "'one'.*'wrist'"),
+        (ARM.replace('velocity="2"', 'velocity="nan"'), "NaN"),
+        (ARM.replace('xyz="0 0 1"', 'xyz="0 1"'), "three numbers"),
+        (ARM.replace("<axis", '<mimic joint="thumb"/><axis'), "mimics 'thumb'.*movable ones"),
+        (ARM.replace("<axis", '<mimic joint="wrist"/><axis'), "circle"),
     ],
 )
 def test_malformed_urdfs_are_explained(tmp_path: Path, text: str, message: str) -> None:
@@ -140,3 +148,32 @@ def test_malformed_urdfs_are_explained(tmp_path: Path, text: str, message: str) 
 def test_missing_urdf_is_explained(tmp_path: Path) -> None:
     with pytest.raises(robots.UrdfError, match=r"nothing\.urdf"):
         robots.compose(tmp_path / "nothing.urdf")
+
+
+JOINT = '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/><axis xyz="0 0 1"/>{4}</joint>'
+
+
+def test_every_kind_of_joint_moves_as_the_urdf_says(tmp_path: Path) -> None:
+    path = tmp_path / "kinds.urdf"
+    limit = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
+    path.write_text(
+        '<robot name="kinds">'
+        + "".join(f'<link name="{name}"/>' for name in "abcd")
+        + JOINT.format("spin", "continuous", "a", "b", '<limit effort="1" velocity="2"/>')
+        + JOINT.format("slide", "prismatic", "b", "c", limit)
+        + JOINT.format("follow", "revolute", "c", "d", limit + '<mimic joint="spin" multiplier="0.5"/>')
+        + "</robot>"
+    )
+    robot = robots.Robot.from_urdf(path, robots.SphereSet({"d": np.array([[1.0, 0.0, 0.0, 0.1]])}))
+    assert robot.joint_names == ("spin", "slide")
+    assert robot.joint_limits.tolist() == [[-math.inf, math.inf], [-1.0, 1.0]]
+    q = torch.tensor(
+        [2 * math.pi + 1.0, 0.3], dtype=torch.float64
+    )  # a continuous joint may turn more than once
+    angle = 1.5 * (2 * math.pi + 1.0)
+    expected = [math.cos(angle), math.sin(angle), 0.3]
+    assert robot.spheres(q)[0][0].tolist() == pytest.approx(expected, abs=1e-6)
+    with pytest.raises(robots.UnknownJointError, match="mimics"):
+        robots.Robot.from_urdf(path, robot.sphere_set, joints=("follow",))
+    with pytest.raises(robots.UnknownJointError, match=r"thumb.*spin"):
+        robots.Robot.from_urdf(path, robot.sphere_set, joints=("thumb",))

@@ -1,0 +1,5 @@
+"""`python -m robots` is the `robots` command."""
+
+from robots.cli import main
+
+main()
