@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -118,6 +119,8 @@ def _restore(
         for i, entry in enumerate(header["frames"])
     ]
     losses = [float(loss) for loss in header["keyframe_losses"]]
+    if not 1 <= len(losses) <= len(frames) or not all(math.isfinite(loss) and loss >= 0 for loss in losses):
+        raise CheckpointError(f"it has {len(frames)} frames and the keyframe losses {losses}"[:200])
     mapper.keyframes.frames, mapper.keyframes.losses = frames[: len(losses)], losses
     newest = range(len(frames))[header["newest"]]
     mapper._newest = frames[newest]
