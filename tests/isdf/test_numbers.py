@@ -4,10 +4,11 @@ import dataclasses
 import math
 import typing
 
+import numpy as np
 import pytest
 
 from isdf import ConfigError
-from isdf.numbers import LARGEST
+from isdf.numbers import LARGEST, require_finite
 from tests.fuzz.configs import MAY_BE_INFINITE, WHOLE
 
 FLOATS = [
@@ -31,3 +32,22 @@ def test_absurd_sizes_are_refused() -> None:
             if typing.get_type_hints(kind)[field.name] is int:
                 with pytest.raises(ConfigError):
                     kind(**{field.name: 100 * LARGEST})
+
+
+@dataclasses.dataclass(frozen=True)
+class Plain:
+    """Its types are not checked at run time, as none are outside the tests."""
+
+    length: "float" = 1.0
+    count: "int" = 1
+    exact: "bool" = True
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"length": None}, {"length": "1"}, {"length": True}, {"count": 1.0}, {"exact": 1}, {"count": None}],
+)
+def test_what_is_of_another_type_is_refused(bad) -> None:
+    require_finite(Plain(np.float32(2.0), np.int64(3), False))  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=f"{next(iter(bad))} must be of type"):
+        require_finite(Plain(**bad))
