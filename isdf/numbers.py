@@ -10,7 +10,7 @@ from typing import Any
 from .errors import ConfigError
 
 # What a field of each type may hold; numpy's numbers are among them.
-KINDS: dict[str, type] = {"int": Integral, "float": Real, "bool": bool}
+KINDS: dict[str, Any] = {"int": Integral, "float": Real, "bool": bool}
 # Whole numbers up to here are exact as floating-point ones.
 LARGEST = 1 << 53
 
