@@ -18,7 +18,7 @@ from .errors import FrameError
 MEDIAN_DEPTH_LIMIT = 60.0
 RIGID_TOLERANCE = 1e-3
 # Farthest position from the origin [m]: beyond, single precision rounds points by a centimetre and more.
-FARTHEST = 1e5
+FARTHEST = 2e5
 
 
 @dataclass(frozen=True)
