@@ -11,13 +11,16 @@ from torch import Tensor
 
 from .errors import CameraError
 
+# Largest |x / z| of a ray, 89.9 degrees, and longest focal length in image sizes.
+STEEPEST, LONGEST = 600.0, 1e5
+
 
 @dataclass(frozen=True)
 class PinholeCamera:
     """Pinhole intrinsics in pixels; OpenCV axes (x right, y down, z forward), pixel centres at integers.
 
     Raises:
-        CameraError: a focal length or a size is not positive, or a value is not finite.
+        CameraError: a focal length or a size is not positive, or a value is not finite, or they fit no lens.
     """
 
     fx: float
@@ -38,6 +41,16 @@ class PinholeCamera:
             )
         if self.width < 1 or self.height < 1:
             raise CameraError(f"image size must be at least 1 x 1, got {self.width} x {self.height}")
+        for name, focal, centre, size in (
+            ("x", self.fx, self.cx, self.width),
+            ("y", self.fy, self.cy, self.height),
+        ):
+            slope = max(abs(centre), abs(size - 1 - centre)) / focal
+            if slope > STEEPEST or focal > LONGEST * size:
+                raise CameraError(
+                    f"f{name} = {focal} and c{name} = {centre} are no camera of {size} pixels: focal lengths are "
+                    "pixels, not metres, and the centre lies in the image"
+                )
 
     @classmethod
     def from_fov(cls, width: int, height: int, horizontal_fov: float) -> PinholeCamera:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -118,9 +119,12 @@ def _restore(
         for i, entry in enumerate(header["frames"])
     ]
     losses = [float(loss) for loss in header["keyframe_losses"]]
+    if not 1 <= len(losses) <= len(frames) or not all(math.isfinite(loss) and loss >= 0 for loss in losses):
+        raise CheckpointError(f"it has {len(frames)} frames and the keyframe losses {losses}"[:200])
     mapper.keyframes.frames, mapper.keyframes.losses = frames[: len(losses)], losses
-    mapper._newest = frames[header["newest"]]
-    mapper._newest_judged = bool(header["newest_judged"])
+    newest = range(len(frames))[header["newest"]]
+    mapper._newest = frames[newest]
+    mapper._newest_judged = bool(header["newest_judged"]) or newest < len(losses)
     return mapper
 
 
@@ -135,9 +139,12 @@ def _check_size(config: NetworkConfig, tensors: dict[str, torch.Tensor]) -> None
 def _check_moments(moments: dict[int, dict[str, torch.Tensor]], parameters: list[torch.nn.Parameter]) -> None:
     """Refuse optimiser state that does not fit the parameters, which would fail only at the next step."""
     for index, values in moments.items():
-        for name in ("exp_avg", "exp_avg_sq"):
-            if values[name].shape != parameters[index].shape:
-                raise CheckpointError(f"optimiser.{index}.{name} has shape {tuple(values[name].shape)}")
+        shapes = {"exp_avg": parameters[index].shape, "exp_avg_sq": parameters[index].shape, "step": ()}
+        for name, shape in shapes.items():
+            if values[name].shape != shape or not values[name].is_floating_point():
+                raise CheckpointError(
+                    f"optimiser.{index}.{name} is {values[name].dtype} {tuple(values[name].shape)}"
+                )
 
 
 def _network(tensors: dict[str, torch.Tensor], prefix: str, config: NetworkConfig) -> SDFNetwork:

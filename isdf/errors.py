@@ -27,6 +27,10 @@ class CheckpointError(IsdfError):
     """A saved map is missing, damaged, or of a version this release cannot read."""
 
 
+class DivergedError(IsdfError):
+    """Training has left the numbers: the loss is NaN or infinite."""
+
+
 class NotReadyError(IsdfError):
     """The map was asked for something it can only give after a first frame."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +17,8 @@ from .errors import FrameError
 # No depth camera for indoor robots measures a median of 60 m; 60 mm and more is every image in millimetres.
 MEDIAN_DEPTH_LIMIT = 60.0
 RIGID_TOLERANCE = 1e-3
+# Farthest position from the origin [m]: beyond, single precision rounds points by a centimetre and more.
+FARTHEST = 2e5
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class DepthFrame:
         object.__setattr__(self, "camera", camera)
         object.__setattr__(self, "depth", _as_depth(depth, camera))
         object.__setattr__(self, "T_world_camera", _as_rigid(T_world_camera))
+        if not math.isfinite(time):
+            raise FrameError(f"a frame's time must be finite seconds, got {time}")
         object.__setattr__(self, "time", float(time))
 
     @classmethod
@@ -123,6 +128,11 @@ def _as_rigid(T: Any) -> Tensor:
         raise FrameError(f"T_world_camera must have shape (4, 4), got {tuple(pose.shape)}")
     if not bool(torch.isfinite(pose).all()):
         raise FrameError("T_world_camera holds NaN or inf: the tracker lost the camera; skip this frame")
+    if float(pose[:3, 3].abs().max()) > FARTHEST:
+        raise FrameError(
+            f"the camera is at {[f'{v:.3g}' for v in pose[:3, 3].tolist()]} m; only up to {FARTHEST:.0f} m from the "
+            "origin do numbers keep a centimetre. In millimetres? Else move the world's origin to the robot"
+        )
     rotation = pose[:3, :3]
     error = float((rotation @ rotation.T - torch.eye(3, dtype=pose.dtype)).abs().max())
     bottom = pose[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=pose.dtype)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,13 +17,14 @@ from torch import Tensor
 
 from .bounds import BoundMethod, supervise
 from .cost import CostField
-from .errors import ConfigError, FrameError, NotReadyError
+from .errors import ConfigError, DivergedError, FrameError, NotReadyError
 from .extent import grown, nothing_seen
 from .field import NeuralField
 from .frames import DepthFrame
 from .keyframes import KeyframeConfig, KeyframeSet, explained_share
 from .losses import LossConfig, total_loss
 from .network import NetworkConfig, SDFNetwork
+from .numbers import require_finite
 from .sampling import RayBatch, SamplingConfig, sample_rays
 
 
@@ -67,6 +69,7 @@ class IsdfConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        require_finite(self)
         if self.bound not in ("ray", "normal", "batch"):
             raise ConfigError(f"bound must be one of ray, normal, batch; got {self.bound!r}")
         if not self.learning_rate > 0 or self.weight_decay < 0:
@@ -181,7 +184,11 @@ class IsdfMapper:
             self._frozen = copy.deepcopy(self._network)
 
     def step(self) -> float:
-        """One optimisation step on the newest frame, the last keyframe and replayed ones; returns the mean loss."""
+        """One optimisation step on the newest frame, the last keyframe and replayed ones; returns the mean loss.
+
+        Raises:
+            DivergedError: the loss is NaN or infinite; the network is as it was before the call.
+        """
         frames, replayed = self._select()
         batch = sample_rays(frames, self.config.sampling, self.generator)
         bound, target = supervise(batch, self.config.bound)
@@ -190,13 +197,19 @@ class IsdfMapper:
         if self.config.losses.noise > 0:
             distance = distance + self._training_noise(batch)
         loss = total_loss(distance, gradient, bound, target, batch.behind, self.config.losses)
+        mean = float(loss.detach().mean())
+        if not math.isfinite(mean):
+            raise DivergedError(
+                f"the loss is {mean} at step {self.steps}: go on from an earlier checkpoint, with a lower "
+                f"learning_rate than {self.config.learning_rate}"
+            )
         assert self._optimiser is not None
         self._optimiser.zero_grad(set_to_none=True)
         loss.mean().backward()
         self._optimiser.step()
         self.steps += 1
         self._record(loss.detach().mean(dim=1), batch, [len(self.keyframes) - 1, *replayed], len(frames))
-        return float(loss.detach().mean())
+        return mean
 
     def run_for(self, cpu_seconds: float) -> int:
         """Train until this process has used `cpu_seconds` of CPU time in all its threads; returns the steps made.

@@ -12,6 +12,7 @@ from torch import Tensor
 from .errors import ConfigError
 from .frames import DepthFrame
 from .network import SDFNetwork
+from .numbers import require_finite
 from .sampling import SamplingConfig, draw_pixels
 
 
@@ -36,6 +37,7 @@ class KeyframeConfig:
     force_after: float = 5.0
 
     def __post_init__(self) -> None:
+        require_finite(self, ("force_after",))
         if self.replayed < 0 or self.test_rays < 1 or self.test_samples < 2:
             raise ConfigError(
                 "keyframes need replayed >= 0, test_rays >= 1 and test_samples >= 2, got "

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .errors import ConfigError
+from .numbers import require_finite
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class LossConfig:
     noise: float = 0.0
 
     def __post_init__(self) -> None:
+        require_finite(self)
         for name in (
             "truncation",
             "surface_weight",

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from .errors import ConfigError
+from .numbers import require_finite
 
 SOFTPLUS_BETA = 100.0
 
@@ -41,6 +42,7 @@ class NetworkConfig:
     output_scale: float = 0.14
 
     def __post_init__(self) -> None:
+        require_finite(self)
         if self.width < 1 or self.hidden_layers < 2 or self.frequency_octaves < 0:
             raise ConfigError(
                 f"network needs width >= 1, hidden_layers >= 2 and frequency_octaves >= 0, got width={self.width}, "

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .errors import ConfigError
 from .frames import DepthFrame
+from .numbers import require_finite
 
 # Most samples a frame: a step on five such frames takes several gigabytes.
 MAX_SAMPLES = 1 << 20
@@ -44,6 +45,7 @@ class SamplingConfig:
     normal_step: int = 1
 
     def __post_init__(self) -> None:
+        require_finite(self)
         if self.rays_per_frame < 1 or self.stratified < 1 or self.near_surface < 0 or self.extra_surface < 0:
             raise ConfigError(
                 "sampling needs rays_per_frame >= 1, stratified >= 1, near_surface >= 0 and extra_surface >= 0, got "

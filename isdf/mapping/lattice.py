@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int8, UInt8
 
+from ..errors import FrameError
 from .bricks import moved
 
 # Fine nodes a side of a refined cell: a cell of four fine steps shares its faces with its neighbours.
@@ -16,6 +17,8 @@ BLOCK = FINE**3
 STEP = 0.0012
 # The lattice grows by whole blocks of this many coarse nodes a side.
 GROWTH = 8
+# Most coarse nodes, at twenty bytes each; at the default spacing they fill a hundred thousand cubic metres.
+MAX_NODES = 32_000_000
 
 
 class LatticeArrays(NamedTuple):
@@ -75,7 +78,11 @@ class Lattice:
         return sum(a.nbytes for a in nodes) + self.corrections[: self.used].nbytes
 
     def include(self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]) -> None:
-        """Grow to cover a world box [m]; new nodes are unknown."""
+        """Grow to cover a world box [m]; new nodes are unknown.
+
+        Raises:
+            FrameError: that would take more than `MAX_NODES`; nothing has changed.
+        """
         edge = self.spacing * GROWTH
         first = np.floor(np.asarray(lower) / edge).astype(np.int64) * GROWTH
         last = np.ceil(np.asarray(upper) / edge).astype(np.int64) * GROWTH
@@ -85,6 +92,11 @@ class Lattice:
         size = last - first
         if np.array_equal(size, self.shape):
             return
+        if float(np.prod(size.astype(float))) > MAX_NODES:
+            raise FrameError(
+                f"this frame would make the map {' x '.join(f'{s * self.spacing:.0f}' for s in size)} m, more than "
+                f"{MAX_NODES} nodes {self.spacing:.3g} m apart; if its pose is right, choose a larger voxel"
+            )
         for name, empty in (
             ("value", 1.0), ("confidence", 0), ("block", -1), ("evidence", 0), ("share", 0.5), ("width", -0.7)
         ):  # fmt: skip

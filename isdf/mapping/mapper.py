@@ -21,6 +21,7 @@ from ..cost import CostField
 from ..errors import ConfigError, FrameError, NotReadyError
 from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
+from ..numbers import require_finite
 from .agreement import compare
 from .bricks import BrickVolume, missing_bricks
 from .completion import load_network
@@ -43,6 +44,10 @@ MARGIN = 0.8
 CONTRADICTED, JUDGED, PATIENCE = 0.35, 60, 5
 # Columns of an image that are compared with the map.
 COLUMNS = 80
+
+
+# Four times the default limit; a brick takes four kilobytes, though most places never get one.
+MOST_BRICKS = 1 << 25
 
 
 @dataclass(frozen=True)
@@ -70,9 +75,20 @@ class MapperConfig:
     max_bricks: int = 8_000_000
 
     def __post_init__(self) -> None:
+        require_finite(
+            self,
+            (
+                "guess_period",
+                "refresh_period",
+            ),
+        )
         for name in ("voxel", "truncation", "max_depth", "max_weight", "max_bricks"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if self.max_bricks > MOST_BRICKS:
+            raise ConfigError(
+                f"max_bricks must be at most {MOST_BRICKS}, got {self.max_bricks}: memory ends before"
+            )
         if not self.truncation > 2 * self.voxel:
             raise ConfigError(
                 f"truncation must be more than two voxels, got {self.truncation} m with a voxel of {self.voxel} m"
@@ -143,12 +159,12 @@ class Mapper:
             return
         box = self._view(depth, T, frame)
         self.bricks.include(box[0], box[1])
-        self._bounds = grown(self._bounds, frame, self.config.max_depth)
-        self.up -= T[:3, 1]
+        bounds, up = grown(self._bounds, frame, self.config.max_depth), self.up - T[:3, 1]
         beyond = np.full(3, BEYOND_ACROSS)
-        beyond[np.abs(self.up).argmax()] = BEYOND_ALONG
-        seen = self._bounds.numpy().astype(float)
+        beyond[np.abs(up).argmax()] = BEYOND_ALONG
+        seen = bounds.numpy().astype(float)
         self.lattice.include(np.minimum(seen[0] - beyond, box[0]), np.maximum(seen[1] + beyond, box[1]))
+        self._bounds, self.up = bounds, up
         self._fuse(depth, T, frame, box, appeared, stride)
         self.frames_seen += 1
         self._touch(box + np.array([[-MARGIN], [MARGIN]]))

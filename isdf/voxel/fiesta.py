@@ -15,6 +15,7 @@ import torch
 
 from ..errors import CheckpointError, ConfigError
 from ..frames import DepthFrame
+from ..numbers import require_finite
 from .mapper import VoxelMapper, check_period
 from .nearest_obstacle import FAR, Changes, NearestObstacle, moved
 from .ray_occupancy import RayOccupancy
@@ -60,6 +61,7 @@ class FiestaConfig:
     max_voxels: int = 64_000_000
 
     def __post_init__(self) -> None:
+        require_finite(self, ("rebuild_period",))
         for name in ("voxel", "max_depth", "max_voxels"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")

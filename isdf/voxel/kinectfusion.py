@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ..errors import ConfigError
 from ..frames import DepthFrame
+from ..numbers import require_finite
 from .mapper import VoxelMapper, check_period
 from .projection import pixel_of, projection, tiny_frame
 from .volume import GrowingVolume, usable_depth
@@ -49,6 +50,7 @@ class KinectFusionConfig:
     max_voxels: int = 64_000_000
 
     def __post_init__(self) -> None:
+        require_finite(self, ("rebuild_period",))
         for name in ("voxel", "behind", "hit", "miss", "max_depth", "max_voxels"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")

@@ -11,6 +11,7 @@ from numba import njit
 
 from ..errors import ConfigError
 from ..frames import DepthFrame
+from ..numbers import require_finite
 from .projection import pixel_of, projection
 from .volume import GrowingVolume, usable_depth
 
@@ -42,6 +43,7 @@ class TsdfConfig:
     max_voxels: int = 64_000_000
 
     def __post_init__(self) -> None:
+        require_finite(self)
         positive = ("voxel", "truncation", "max_depth", "max_weight", "max_voxels")
         for name in positive:
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):

@@ -14,6 +14,10 @@ from ..frames import DepthFrame
 GROWTH = 16
 
 
+# Four times the methods' own limits; with what rebuilding takes, some gigabytes.
+MOST_VOXELS = 1 << 28
+
+
 class GrowingVolume:
     """Named channels over one box of voxels, whose lattice is fixed to the world's origin.
 
@@ -29,6 +33,10 @@ class GrowingVolume:
     """
 
     def __init__(self, voxel: float, channels: Mapping[str, type[np.generic]], max_voxels: int) -> None:
+        if max_voxels > MOST_VOXELS:
+            raise ConfigError(
+                f"max_voxels must be at most {MOST_VOXELS}, got {max_voxels}: memory ends before"
+            )
         if not (np.isfinite(voxel) and voxel > 0) or max_voxels < 1:
             raise ConfigError(
                 f"voxel must be a positive edge in metres and max_voxels positive, got {voxel} and {max_voxels}"

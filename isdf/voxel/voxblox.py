@@ -10,6 +10,7 @@ import torch
 
 from ..errors import CheckpointError, ConfigError
 from ..frames import DepthFrame
+from ..numbers import require_finite
 from . import bundled_tsdf, quasi_euclidean
 from .bundled_tsdf import BundledTsdf
 from .mapper import VoxelMapper, check_period
@@ -47,6 +48,7 @@ class VoxbloxConfig:
     max_voxels: int = 64_000_000
 
     def __post_init__(self) -> None:
+        require_finite(self, ("rebuild_period",))
         for name in ("voxel", "max_distance", "max_depth", "max_weight", "max_voxels"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")

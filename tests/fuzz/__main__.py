@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import resource
 import time
 import warnings
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from hypothesis.errors import HypothesisWarning
 
 from tests.fuzz import configs, mapfiles, readers
 from tests.fuzz.accepts import OUTCOMES
+
+ADDRESS_SPACE = 12 << 30
 
 PROPERTIES = {
     "readers": (readers.broken_recordings, readers.empty_places),
@@ -37,6 +40,8 @@ class Fuzz:
 def main(fuzz: Fuzz) -> None:
     """Take turns until the time is over; print the counts."""
     torch.set_num_threads(1)
+    # Beyond this an allocation fails, and names its place, instead of the machine.
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     logging.disable(logging.WARNING)
     warnings.simplefilter("ignore", HypothesisWarning)
     turn = settings(max_examples=fuzz.examples, deadline=None, suppress_health_check=list(HealthCheck))

@@ -25,7 +25,7 @@ FLOATS = st.one_of(
 )
 INTS = st.one_of(st.integers(-3, 40), st.integers(), st.sampled_from([2**31, 2**63, 10**20]))
 # What is unbounded on purpose.
-MAY_BE_INFINITE = {"force_after", "rebuild_period", "max_depth"}
+MAY_BE_INFINITE = {"force_after", "rebuild_period", "guess_period", "refresh_period"}
 
 
 def values(hint: Any, ints: st.SearchStrategy[int]) -> st.SearchStrategy[Any] | None:

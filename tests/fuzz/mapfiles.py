@@ -125,7 +125,9 @@ def lying_tensors(data: st.DataObject, method: str) -> None:
             tensors[name] = torch.ones(shape, dtype=value.dtype)
         elif kind == "values":
             fill = data.draw(st.sampled_from([float("nan"), float("inf"), 1e38, -1.0]))
-            tensors[name] = torch.full_like(value, fill) if value.is_floating_point() else value * 0
+            tensors[name] = (
+                torch.full(value.shape, fill).to(value.dtype) if value.is_floating_point() else value * 0
+            )
         elif kind == "empty":
             tensors[name] = value.reshape(-1)[:0].clone()
         mapfile.write(path, tensors, header)

@@ -85,8 +85,20 @@ def test_back_projection_is_geometry() -> None:
     torch.testing.assert_close(points[:, 2], torch.full((4800,), 5.0))
 
 
-@pytest.mark.parametrize("bad", [{"fx": 0.0}, {"fy": -1.0}, {"cx": math.nan}, {"width": 0}])
+@pytest.mark.parametrize(
+    "bad", [{"fx": 0.0}, {"fy": -1.0}, {"cx": math.nan}, {"width": 0}, {"fx": 1e-4}, {"fy": 1e9}, {"cy": 1e6}]
+)
 def test_impossible_cameras_are_refused(bad: dict) -> None:
     values = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "width": 2, "height": 2} | bad
     with pytest.raises(CameraError):
         PinholeCamera(**values)
+
+
+def test_places_and_times_that_numbers_cannot_hold_are_refused() -> None:
+    far = np.eye(4)
+    far[1, 3] = 4.6e6  # a UTM northing
+    with pytest.raises(FrameError, match="move the world's origin"):
+        DepthFrame(image(), far, CAMERA)
+    for time in (math.nan, math.inf):
+        with pytest.raises(FrameError, match="time"):
+            DepthFrame(image(), np.eye(4), CAMERA, time)

@@ -13,6 +13,7 @@ from safetensors.torch import save_file
 from isdf import (
     CheckpointError,
     ConfigError,
+    DivergedError,
     FrameError,
     IsdfConfig,
     IsdfMapper,
@@ -271,3 +272,13 @@ def test_foreign_damaged_and_newer_files_are_refused(tmp_path) -> None:
 def test_impossible_configurations_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
         IsdfConfig(**bad)
+
+
+def test_a_diverged_training_says_so_and_leaves_the_network() -> None:
+    mapper = mapped(frames=2)
+    with torch.no_grad():
+        mapper.network.layers[0].weight.mul_(1e30)
+    before = [p.clone() for p in mapper.network.parameters()]
+    with pytest.raises(DivergedError, match="lower learning_rate"):
+        mapper.step()
+    assert all(torch.equal(a, b) for a, b in zip(before, mapper.network.parameters(), strict=True))
