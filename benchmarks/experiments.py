@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-from isdf import IsdfConfig
+from isdf import IsdfConfig, MapperConfig
 from isdf.bounds import BoundMethod
 from isdf.datasets import DepthSequence
 from isdf.methods import Config, OnlineMapper
@@ -67,6 +67,7 @@ class Job:
 
 
 METHODS: dict[str, Config] = {
+    "default": MapperConfig(),
     "isdf": IsdfConfig(),
     "voxblox": VoxbloxConfig(),
     "fiesta": FiestaConfig(),

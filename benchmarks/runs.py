@@ -18,7 +18,7 @@ import torch
 
 from benchmarks.experiments import REAL, REGION_OF, Job
 from benchmarks.stages import stage_times
-from isdf import IsdfConfig, IsdfMapper, NotReadyError
+from isdf import IsdfConfig, IsdfMapper, MapperConfig, NotReadyError
 from isdf.datasets import DepthSequence, open_sequence
 from isdf.evaluation import (
     Truth,
@@ -167,7 +167,7 @@ def _judge(study: Study, job: Job, index: int, moment: float, steps: int, shown:
     if shown is None:
         return empty
     truth = read_truth(study.points_file(job.sequence, f"{index:02d}"))
-    unmapped = None if isinstance(job.config, IsdfConfig) else shown.confidence(truth.points) == 0
+    unmapped = None if isinstance(job.config, (IsdfConfig, MapperConfig)) else shown.confidence(truth.points) == 0
     region = _region(study, job, index, truth, unmapped)
     own = evaluate(shown, truth, "own").gradient_distance
     found: dict[str, Any] = {

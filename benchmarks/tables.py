@@ -16,6 +16,7 @@ Result = dict[str, Any]
 Value = Callable[[Result], float | None]
 # Order and names of the methods in every table and figure.
 NAMES = {
+    "default": "default map",
     "isdf": "iSDF (ours)",
     "voxblox": "Voxblox",
     "fiesta": "FIESTA",

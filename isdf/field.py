@@ -42,7 +42,46 @@ def check_points(points: Tensor) -> None:
         )
 
 
-class NeuralField:
+class AnalyticField:
+    """Base of the fields that know their own gradient: what follows from `distance_and_gradient`.
+
+    Attributes:
+        bounds: (2, 3) lower and upper corner of what was observed [m].
+    """
+
+    bounds: Float[Tensor, "2 3"]
+
+    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Signed distance [m] at world points [m], positive outside; differentiable by autograd."""
+        check_points(points)
+        if torch.is_grad_enabled() and points.requires_grad:
+            return _AnalyticGradient.apply(points, self)
+        return self._distance(points)
+
+    def distance_and_gradient(
+        self, points: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Signed distance [m] and its spatial gradient at world points [m]; no autograd graph."""
+        raise NotImplementedError
+
+    def bake(
+        self, spacing: float = 0.05, bounds: Float[Tensor, "2 3"] | None = None, padding: float = 0.2
+    ) -> GridField:
+        """Sample the field on a regular grid, whose queries cost the same everywhere.
+
+        Args:
+            spacing: distance of grid points [m].
+            bounds: (2, 3) region [m]; by default what was observed.
+            padding: added on every side [m].
+        """
+        return bake(self, self.bounds if bounds is None else bounds, spacing, padding)
+
+    def _distance(self, points: Tensor) -> Tensor:
+        """Distances alone, without a graph; fields that have them cheaper say so."""
+        return self.distance_and_gradient(points)[0]
+
+
+class NeuralField(AnalyticField):
     """An immutable snapshot of a map: it does not change while mapping goes on.
 
     Args:
@@ -54,11 +93,7 @@ class NeuralField:
         self._network = copy.deepcopy(network).requires_grad_(False)
         self.bounds = bounds.clone()
 
-    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Signed distance [m] at world points [m], positive outside; differentiable by autograd."""
-        check_points(points)
-        if torch.is_grad_enabled() and points.requires_grad:
-            return _AnalyticGradient.apply(points, self)
+    def _distance(self, points: Tensor) -> Tensor:
         flat = self._to_network(points)
         with torch.no_grad():
             out = torch.cat([self._network(block) for block in flat.split(QUERY_BLOCK)] or [flat[:, 0]])
@@ -76,23 +111,11 @@ class NeuralField:
         gradient = torch.cat([p[1] for p in parts] or [flat])
         return distance.to(points).view(points.shape[:-1]), gradient.to(points).view(points.shape)
 
-    def bake(
-        self, spacing: float = 0.05, bounds: Float[Tensor, "2 3"] | None = None, padding: float = 0.2
-    ) -> GridField:
-        """Sample the field on a regular grid, whose queries are many times faster.
-
-        Args:
-            spacing: distance of grid points [m].
-            bounds: (2, 3) region [m]; by default what was observed.
-            padding: added on every side [m].
-        """
-        return bake(self, self.bounds if bounds is None else bounds, spacing, padding)
-
     def _to_network(self, points: Tensor) -> Tensor:
         return points.detach().reshape(-1, 3).to(self._network.origin)
 
 
-class GridField:
+class GridField(AnalyticField):
     """Trilinear interpolation of distances on a regular grid.
 
     Outside the grid the value is that of the closest point on its boundary and the gradient across it is zero.
@@ -115,11 +138,7 @@ class GridField:
             [self.origin, self.origin + (torch.tensor(values.shape, device=origin.device) - 1) * self.spacing]
         )
 
-    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Signed distance [m] at world points [m]; differentiable by autograd."""
-        check_points(points)
-        if torch.is_grad_enabled() and points.requires_grad:
-            return _AnalyticGradient.apply(points, self)
+    def _distance(self, points: Tensor) -> Tensor:
         with torch.no_grad():
             flat = points.detach().reshape(-1, 3).to(self.values)
             # grid_sample wants (z, y, x) volumes and x, y, z in [-1, 1]; it clamps as we do, at half our cost.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.metadata
 import os
@@ -17,6 +18,7 @@ def example_robot_data() -> Path:
     return manifest.parent / "robots"
 
 
+@functools.cache  # a scan of all files of the package, asked for once a mesh
 def installed_file(package: str, ending: str, extra: str) -> Path:
     """The file of an installed package whose path ends like this.
 

@@ -11,14 +11,14 @@ from jaxtyping import Float, Int, Int8, UInt8
 from numba import njit
 from torch import Tensor
 
-from ..field import GridField, _AnalyticGradient, bake, check_points
+from ..field import AnalyticField, check_points
 from .lattice import FINE, STEP, LatticeArrays
 
 # Below this many points a second thread costs more than it saves.
 PARALLEL = 20_000
 
 
-class LatticeField:
+class LatticeField(AnalyticField):
     """Piecewise trilinear distances with confidences; immutable.
 
     Outside the lattice the distance is that of the closest point on its rim, and the gradient across it is zero.
@@ -52,13 +52,6 @@ class LatticeField:
         """Memory of all that queries need [bytes]."""
         return sum(a.nbytes for a in (self._value, self._confidence, self._block, self._corrections))
 
-    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Signed distance [m] at world points [m], positive outside; differentiable by autograd."""
-        check_points(points)
-        if torch.is_grad_enabled() and points.requires_grad:
-            return _AnalyticGradient.apply(points, self)
-        return self.distance_and_gradient(points)[0]
-
     def distance_and_gradient(
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
@@ -79,18 +72,6 @@ class LatticeField:
         out = np.empty(len(flat), np.float32)
         _confidence(flat, self._origin, self.spacing, self._confidence, out)
         return torch.from_numpy(out).to(points).view(points.shape[:-1])
-
-    def bake(
-        self, spacing: float = 0.05, bounds: Float[Tensor, "2 3"] | None = None, padding: float = 0.2
-    ) -> GridField:
-        """Sample the field on a regular grid.
-
-        Args:
-            spacing: distance of grid points [m].
-            bounds: (2, 3) region [m]; by default what was observed.
-            padding: added on every side [m].
-        """
-        return bake(self, self.bounds if bounds is None else bounds, spacing, padding)
 
     def _split(self, kernel: Any, points: np.ndarray, distance: np.ndarray, gradient: np.ndarray) -> None:
         """Run a kernel over the points in as many threads as torch uses."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..errors import ConfigError
-from ..field import _AnalyticGradient, check_points
+from ..field import AnalyticField, check_points
 
 # Points a block: the eight candidates of each stay in the processor's cache.
 QUERY_BLOCK = 8192
@@ -17,7 +17,7 @@ QUERY_BLOCK = 8192
 KNOWN_SHARE = 0.25
 
 
-class NearestSeedField:
+class NearestSeedField(AnalyticField):
     """Signed distance to surface patches: discs of one radius around surface points, facing along their normals.
 
     The candidates for a point are the nearest seeds of the eight grid points around it, so that distances are
@@ -69,13 +69,6 @@ class NearestSeedField:
     def nbytes(self) -> int:
         """Memory of all tensors [bytes]."""
         return sum(t.nbytes for t in (self._nearest, self._signed, self._seeds, self._normals))
-
-    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Signed distance [m] at world points [m], positive outside; differentiable by autograd."""
-        check_points(points)
-        if torch.is_grad_enabled() and points.requires_grad:
-            return _AnalyticGradient.apply(points, self)
-        return self.distance_and_gradient(points)[0]
 
     def distance_and_gradient(
         self, points: Float[Tensor, "*batch 3"]
