@@ -183,7 +183,9 @@ def _pictures(options: Options, folder: Path, name: str, results: Sequence[Resul
             keyframes[title] = np.array(result["keyframes"]).reshape(-1, 3)
     slices, meshes = folder / f"slices_{name}.png", folder / f"meshes_{name}.png"
     poses = open_sequence(source).poses
-    save_slice_comparison(slices, fields, options.heights, room, poses, keyframes, predictive=[NAMES["isdf"]])
+    save_slice_comparison(
+        slices, fields, options.heights, room, poses, keyframes, predictive=[NAMES["default"], NAMES["isdf"]]
+    )
     views = {
         title: dollhouse(zero_level_mesh(field, options.mesh_spacing, room, padding=0.06), room.numpy())
         for title, field in fields.items()

@@ -31,7 +31,6 @@ from isdf.evaluation import (
 )
 from isdf.methods import OnlineMapper, new_mapper
 from isdf.runner import RunReport, Watch
-from isdf.voxel import VoxelMapper
 from robots.simulation import load_truth
 
 # Real sequences by their folder in the data directory, and their frames a second, which the folders do not say.
@@ -167,7 +166,9 @@ def _judge(study: Study, job: Job, index: int, moment: float, steps: int, shown:
     if shown is None:
         return empty
     truth = read_truth(study.points_file(job.sequence, f"{index:02d}"))
-    unmapped = None if isinstance(job.config, (IsdfConfig, MapperConfig)) else shown.confidence(truth.points) == 0
+    unmapped = (
+        None if isinstance(job.config, (IsdfConfig, MapperConfig)) else shown.confidence(truth.points) == 0
+    )
     region = _region(study, job, index, truth, unmapped)
     own = evaluate(shown, truth, "own").gradient_distance
     found: dict[str, Any] = {
@@ -225,14 +226,14 @@ def _identity(job: Job) -> dict[str, Any]:
 
 
 def _keyframes(mapper: OnlineMapper) -> list[list[float]]:
-    """Camera positions of the keyframes [m]; none of a voxel map."""
-    frames = [] if isinstance(mapper, VoxelMapper) else mapper.keyframes.frames
+    """Camera positions of the keyframes [m], which only the paper's method has."""
+    frames = mapper.keyframes.frames if isinstance(mapper, IsdfMapper) else []
     return [frame.T_world_camera[:3, 3].tolist() for frame in frames]
 
 
 def _memory(mapper: OnlineMapper) -> dict[str, int]:
     """Bytes of the field that answers queries, and of all that mapping goes on from."""
-    if isinstance(mapper, VoxelMapper):
+    if not isinstance(mapper, IsdfMapper):
         return {"field": mapper.field().nbytes, "state": mapper.nbytes}
     weights = sum(p.nbytes for p in mapper.network.parameters())
     # Two moments of the optimiser, the frozen copy, and the replayed images.

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import experiments, mapping, mapping_report, runs, tables
-from benchmarks.experiments import Clock, Job
+from benchmarks.experiments import METHODS, Clock, Job
 from benchmarks.runs import Study, prepare, run
 from benchmarks.stages import stage_times
 from isdf import IsdfConfig, IsdfMapper, NetworkConfig, PinholeCamera, SamplingConfig
@@ -202,6 +202,15 @@ def test_held_out_frames_judge_a_map_of_the_others(study) -> None:
     )
     assert values["held_out"]["rays"] == 40 and values["report"]["frames"] == 14
     assert values["held_out"]["median_error"] < 0.05 and values["held_out"]["blocked"] < 0.02
+
+
+def test_every_method_of_the_comparison_is_judged(recorded, tmp_path) -> None:
+    assert mapping.main(options(recorded, tmp_path, experiments=("main",), methods=())) == []
+    results = [json.loads(path.read_text()) for path in (tmp_path / "out" / "main").glob("*.json")]
+    assert {result["method"] for result in results} == set(METHODS)
+    for result in results:
+        assert result["over_time"][-1]["visible"]["sdf_error"] < 0.5 and result["memory"]["field"] > 0
+        assert bool(result["keyframes"]) == (result["method"] == "isdf")
 
 
 def test_stages_sum_to_the_step_and_none_is_forgotten(recorded) -> None:
