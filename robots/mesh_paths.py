@@ -18,7 +18,6 @@ def example_robot_data() -> Path:
     return manifest.parent / "robots"
 
 
-@functools.cache  # a scan of all files of the package, asked for once a mesh
 def installed_file(package: str, ending: str, extra: str) -> Path:
     """The file of an installed package whose path ends like this.
 
@@ -60,10 +59,16 @@ def _package_candidates(name: str, urdf_path: Path) -> list[Path]:
     roots += [Path(entry) for entry in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if entry]
     roots += [Path(e) / "share" for e in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if e]
     if name.startswith("example-robot-data/"):
-        roots.append(example_robot_data().parents[1])
+        roots.append(_example_share())
     # A ROS package path may name the package's own folder or the one that holds it.
     package, _, rest = name.partition("/")
     return [root / name for root in roots] + [root / rest for root in roots if root.name == package]
+
+
+@functools.cache
+def _example_share() -> Path:
+    """Where `package://example-robot-data` leads; asked for once a mesh, and a scan of all files of the package."""
+    return example_robot_data().parents[1]
 
 
 def cache_dir() -> Path:
