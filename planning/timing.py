@@ -1,19 +1,23 @@
-"""Times for a path under velocity and acceleration limits."""
+"""Times for a path under velocity and acceleration limits, by TOPP-RA (Pham and Pham, T-RO 2018)."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy import ndarray
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from planning.errors import ConfigError
 from planning.trajectory import Trajectory
 
 MIN_DURATION = 0.1  # [s], of a trajectory that does not move
-MIN_POINTS = 60  # of the speed profile; fewer waypoints are subdivided
-CURVATURE_SHARE = 0.5  # of the acceleration limits, for turning; the rest is for speeding up and braking
+MIN_POINTS = 60  # of the path; fewer waypoints are subdivided
+GRID = 4  # points a segment at which the speed along the path is decided
+UNLIMITED = 1e9  # stands for a limit that a joint does not have [rad/s | rad/s^2 | m/s | m/s^2]
 
 
 def retime(
@@ -21,12 +25,12 @@ def retime(
     velocity_limits: Float[Tensor, " dof"],
     acceleration_limits: Float[Tensor, " dof"],
 ) -> Trajectory:
-    """Give a path the fastest times from rest to rest that a trapezoidal speed profile within the limits
-    allows.
+    """Give a path the fastest times from rest to rest within the limits.
 
-    The speed along the joint path starts and ends at zero, keeps every joint's velocity limit, slows down
-    where the path turns, and speeds up and brakes at no more than the accelerations left. The path itself is
-    unchanged: when it has few waypoints, more are put on its segments.
+    The times are those at which TOPP-RA passes the waypoints on a cubic spline through them. Mean velocities and
+    accelerations between waypoints are averages of the spline's, so they keep the limits, too; what the grid of
+    TOPP-RA leaves of a violation is removed by slowing the whole down. The path itself, straight between its
+    waypoints, is unchanged: when it has few waypoints, more are put on its segments.
 
     Args:
         trajectory: its waypoints are used, its times are not.
@@ -34,8 +38,8 @@ def retime(
         acceleration_limits: (dof,) [rad/s^2 | m/s^2], positive; inf where there is none.
 
     Returns:
-        A trajectory from time 0 whose segment velocities, and their differences over half the two segments'
-        times (from rest at the first and to rest at the last waypoint), keep the limits. Its times are
+        A trajectory from time 0, longer than 0 s, whose segment velocities, and their differences over half the two
+        segments' times (from rest at the first and to rest at the last waypoint), keep the limits. Its times are
         float64, since rounding them would break the limits.
 
     Raises:
@@ -53,19 +57,41 @@ def retime(
         still = path.expand(2, -1).clone()
         return Trajectory(still, torch.tensor([0.0, MIN_DURATION], dtype=torch.float64))
     exact = path.double()
-    ds = exact.diff(dim=0).norm(dim=1)
-    tangent = exact.diff(dim=0) / ds[:, None]
-    speed = _speed_profile(ds, _speed_limit(ds, tangent, v_max, a_max), _tangential_limit(tangent, a_max))
-    if not torch.isfinite(speed).all():
-        raise ConfigError("retime: a joint that moves has neither a velocity nor an acceleration limit.")
-    dt = 2 * ds / (speed[:-1] + speed[1:])
-    return Trajectory(path, torch.cat([dt.new_zeros(1), dt.cumsum(0)]) * (1 + 1e-9))  # a hair for rounding
+    free = v_max.isinf() & a_max.isinf() & (exact != exact[0]).any(dim=0)
+    if free.any():
+        raise ConfigError(
+            f"retime: joint {int(free.nonzero()[0])} moves and has neither a velocity nor an acceleration limit."
+        )
+    finite = (v_max.clamp_max(UNLIMITED).numpy(), a_max.clamp_max(UNLIMITED).numpy())
+    times = torch.from_numpy(_fastest(exact.numpy(), *finite))
+    return Trajectory(path, times * slowdown(exact, times, v_max, a_max))
+
+
+def slowdown(
+    path: Float[Tensor, "n dof"],
+    times: Float[Tensor, " n"],
+    velocity_limits: Float[Tensor, " dof"],
+    acceleration_limits: Float[Tensor, " dof"],
+) -> float:
+    """By what factor (at least 1) times must be stretched to keep the limits, from rest to rest.
+
+    Velocities are those of the segments, accelerations their differences over half the two segments' times.
+    """
+    dt = times.diff()[:, None]
+    velocity = path.diff(dim=0) / dt
+    rest = torch.zeros_like(velocity[:1])
+    between = torch.cat([dt[:1], dt[:-1] + dt[1:], dt[-1:]]) / 2
+    acceleration = torch.cat([rest, velocity, rest]).diff(dim=0) / between
+    too_fast = float((velocity.abs() / velocity_limits).max())
+    too_hard = float((acceleration.abs() / acceleration_limits).max())
+    return max(1.0, too_fast, math.sqrt(too_hard)) * (1 + 1e-9)  # a hair for rounding
 
 
 def _subdivided(waypoints: Float[Tensor, "n dof"]) -> Float[Tensor, "m dof"]:
     """The path without repeated waypoints, with points added on its segments if it has few."""
     moved = torch.cat([torch.ones(1, dtype=torch.bool), waypoints.diff(dim=0).norm(dim=1) > 1e-9])
     path = waypoints[moved]
+    path[-1] = waypoints[-1]
     if len(path) == 1 or len(path) >= MIN_POINTS:
         return path
     lengths = path.diff(dim=0).norm(dim=1)
@@ -77,42 +103,16 @@ def _subdivided(waypoints: Float[Tensor, "n dof"]) -> Float[Tensor, "m dof"]:
     return torch.cat([*parts, path[-1:]])
 
 
-def _speed_limit(
-    ds: Float[Tensor, " e"],
-    tangent: Float[Tensor, "e dof"],
-    v_max: Float[Tensor, " dof"],
-    a_max: Float[Tensor, " dof"],
-) -> Float[Tensor, " e+1"]:
-    """Path speed allowed at each waypoint by the velocities and by how sharply the path turns around it."""
-    segment = (v_max / tangent.abs()).amin(dim=1)
-    limit = torch.full((len(ds) + 1,), torch.inf, dtype=ds.dtype)
-    limit[:-1] = segment
-    limit[1:] = torch.minimum(limit[1:], segment)
-    turn = tangent.diff(dim=0).abs()
-    # Turning at waypoint i takes at most max(speed)^2 |turn| / min(ds), speeds taken at i-1, i and i+1.
-    corner = (CURVATURE_SHARE * a_max * torch.minimum(ds[:-1], ds[1:])[:, None] / turn).amin(dim=1).sqrt()
-    for part in (limit[:-2], limit[1:-1], limit[2:]):
-        torch.minimum(part, corner, out=part)
-    return limit
+def _fastest(
+    path: Float[ndarray, "n dof"], v_max: Float[ndarray, " dof"], a_max: Float[ndarray, " dof"]
+) -> Float[ndarray, " n"]:
+    """When TOPP-RA passes the waypoints on the cubic spline through them [s]."""
+    from planning.compiled.topp import path_speeds
 
-
-def _tangential_limit(tangent: Float[Tensor, "e dof"], a_max: Float[Tensor, " dof"]) -> Float[Tensor, " e"]:
-    """Acceleration along the path allowed on each segment, given its tangent and its neighbours'."""
-    steepest = tangent.abs().clone()
-    steepest[1:] = torch.maximum(steepest[1:], tangent[:-1].abs())
-    steepest[:-1] = torch.maximum(steepest[:-1], tangent[1:].abs())
-    return (1 - CURVATURE_SHARE) * (a_max / steepest).amin(dim=1)
-
-
-def _speed_profile(
-    ds: Float[Tensor, " e"], limit: Float[Tensor, " m"], acceleration: Float[Tensor, " e"]
-) -> Float[Tensor, " m"]:
-    """The fastest path speeds from rest to rest: speeding up forwards, then braking backwards."""
-    squares = limit.square().tolist()
-    gains = (2 * acceleration * ds).tolist()
-    squares[0] = squares[-1] = 0.0
-    for i, gain in enumerate(gains):
-        squares[i + 1] = min(squares[i + 1], squares[i] + gain)
-    for i in range(len(gains) - 1, -1, -1):
-        squares[i] = min(squares[i], squares[i + 1] + gains[i])
-    return torch.tensor(squares, dtype=ds.dtype).sqrt()
+    knots = np.r_[0.0, np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()]
+    spline = CubicSpline(knots, path, bc_type="natural")
+    share = np.arange(GRID) / GRID
+    grid = np.r_[(knots[:-1, None] + share * np.diff(knots)[:, None]).ravel(), knots[-1]]
+    speed = np.sqrt(path_speeds(np.diff(grid), spline(grid, 1), spline(grid, 2), v_max, a_max))
+    times = np.r_[0.0, (2 * np.diff(grid) / (speed[:-1] + speed[1:])).cumsum()]
+    return times[::GRID]

@@ -75,14 +75,15 @@ class Trajectory:
         if num_waypoints is not None and num_waypoints < 1:
             raise TrajectoryError(f"Trajectory: num_waypoints must be at least 1, got {num_waypoints}.")
         lengths = path.diff(dim=0).norm(dim=1)
-        if num_waypoints is None:
-            moved = torch.cat([lengths.new_ones(1), lengths]) > 0
-            path, lengths = path[moved], lengths[lengths > 0]
-            if len(path) == 1:
-                return cls(path, path.new_zeros(1))
         arc = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
         if num_waypoints is None:
-            return cls(path, arc / arc[-1] * duration)
+            if arc[-1] == 0:
+                return cls(path[:1], path.new_zeros(1))
+            times = arc / arc[-1] * duration
+            moved = torch.cat([times.new_ones(1), times.diff()]) > 0
+            waypoints = path[moved]
+            waypoints[-1] = path[-1]  # even if it differs too little to have a time of its own
+            return cls(waypoints, times[moved])
         fractions = torch.linspace(0, 1, num_waypoints, dtype=path.dtype, device=path.device)
         waypoints = _interpolate(arc, path, fractions * arc[-1])
         if num_waypoints > 1:

@@ -1,9 +1,14 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from planning import ConfigError, Trajectory, retime
+from planning.timing import slowdown
 
 
 def _rates(trajectory):
@@ -44,13 +49,63 @@ def test_limits_hold_and_the_path_stays(path, v_max, a_max):
     assert timed.joint_path_length == pytest.approx(Trajectory.through(path).joint_path_length, rel=1e-4)
 
 
-def test_a_straight_move_is_a_trapezoid_of_half_the_acceleration():
+def test_a_straight_move_is_a_trapezoid():
     timed = retime(
         Trajectory.line(torch.zeros(1), torch.tensor([2.0]), 200), torch.tensor([1.0]), torch.tensor([2.0])
     )
-    assert timed.duration == pytest.approx(2.0 / 1.0 + 1.0 / 1.0, rel=0.03)  # length / v + v / a, a = 1
+    assert timed.duration == pytest.approx(2.0 / 1.0 + 1.0 / 2.0, rel=0.01)  # length / v + v / a
     velocity, _ = _rates(timed)
     assert float(velocity.max()) == pytest.approx(1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["curve", "corner", "noise"])
+def test_as_fast_as_the_library_of_the_method(name):
+    """toppra on the same spline; a path that turns back is left out, where toppra's grid exceeds the limits."""
+    toppra = pytest.importorskip("toppra", reason="toppra is not installed")
+    timed = retime(Trajectory.through(PATHS[name]), torch.ones(3), 2 * torch.ones(3))
+    q = timed.waypoints.double().numpy()
+    knots = np.r_[0.0, np.linalg.norm(np.diff(q, axis=0), axis=1).cumsum()]
+    limits = np.array([[-1.0, 1.0]] * 3)
+    constraints = [
+        toppra.constraint.JointVelocityConstraint(limits),
+        toppra.constraint.JointAccelerationConstraint(2 * limits),
+    ]
+    grid = np.interp(np.arange(4 * len(knots) - 3) / 4, np.arange(len(knots)), knots)
+    spline = toppra.SplineInterpolator(knots, q, bc_type="natural")
+    library = toppra.algorithm.TOPPRA(constraints, spline, gridpoints=grid).compute_trajectory(0.0, 0.0)
+    assert timed.duration == pytest.approx(library.duration, rel=0.01)
+
+
+def test_no_joint_rests_where_the_path_allows_more():
+    """Everywhere some joint is at one of its limits, or nearly: the fastest times have no slack."""
+    timed = retime(Trajectory.through(CURVE), torch.ones(3), torch.ones(3))
+    velocity, acceleration = _rates(timed)
+    busy = torch.maximum(velocity.abs().amax(1), acceleration[1:].abs().amax(1))
+    assert float(busy.min()) > 0.8 and float(busy.mean()) > 0.97
+
+
+@given(
+    steps=arrays(np.float64, st.tuples(st.integers(1, 12), st.just(2)), elements=st.floats(-2, 2)),
+    v_max=st.floats(0.01, 10),
+    a_max=st.floats(0.01, 100),
+)
+@settings(max_examples=60, deadline=None)
+def test_no_path_gets_no_time_or_breaks_limits(steps, v_max, a_max):
+    path = torch.from_numpy(np.cumsum(np.r_[np.zeros((1, 2)), steps], axis=0))
+    limits = torch.tensor([v_max, 2 * v_max]).double(), torch.tensor([a_max, a_max]).double()
+    timed = retime(Trajectory.through(path), *limits)
+    assert timed.duration > 0 and torch.isfinite(timed.times).all() and (timed.times.diff() > 0).all()
+    velocity, acceleration = _rates(timed)
+    assert (velocity.abs() <= limits[0] * (1 + 1e-6)).all()
+    assert (acceleration.abs() <= limits[1] * (1 + 1e-6)).all()
+
+
+def test_slowdown_measures_what_breaks_the_limits():
+    path, times = torch.tensor([[0.0], [1.0], [2.0]]).double(), torch.tensor([0.0, 1.0, 2.0]).double()
+    # Velocity 1, from rest within half a second of the first segment's time: acceleration 2.
+    assert slowdown(path, times, torch.tensor([0.5]), torch.tensor([100.0])) == pytest.approx(2)
+    assert slowdown(path, times, torch.tensor([5.0]), torch.tensor([0.5])) == pytest.approx(2)
+    assert slowdown(path, times, torch.tensor([5.0]), torch.tensor([5.0])) == pytest.approx(1)
 
 
 def test_looser_limits_are_never_slower():
