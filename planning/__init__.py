@@ -7,6 +7,7 @@ BaseTracker`.
 from planning.chomp import Chomp, ChompConfig
 from planning.constraints import AxisConstraint, Constraint, GoalPose
 from planning.descent import DescentConfig
+from planning.ends import nearest_free
 from planning.errors import ConfigError, FieldError, PlanningError, SolverError, TrajectoryError
 from planning.initialise import NoPath, RrtConfig, rrt_connect
 from planning.metric import MetricConfig
@@ -66,6 +67,7 @@ __all__ = [
     "ValidationConfig",
     "WorkspaceConfig",
     "check",
+    "nearest_free",
     "retime",
     "rrt_connect",
 ]

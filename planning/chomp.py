@@ -14,6 +14,7 @@ from torch import Tensor
 
 from planning.constraints import Constraint, project_to_constraints, violation
 from planning.descent import Descent, DescentConfig, descend
+from planning.ends import check_ends, offered
 from planning.errors import ConfigError, TrajectoryError
 from planning.hamiltonian import shaken
 from planning.limits import project_to_limits
@@ -22,7 +23,7 @@ from planning.objective import Objective, ObjectiveConfig
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
 from planning.trajectory import Trajectory
-from planning.validation import Validation, ValidationConfig, check, check_ends
+from planning.validation import Validation, ValidationConfig, check
 from planning.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -108,13 +109,19 @@ class Chomp:
         self._check(guesses)
         config, run = self.config, _Run(self.robot, sdf, self.config, constraints)
         guesses, verdict = run.with_valid_ends(guesses)
-        if verdict is not None or len(guesses[0]) < 3:
-            verdict = verdict or run.judge(guesses[0])
-            return _result(guesses[0], verdict, [], started)
+        if verdict is not None:
+            left = None if deadline is None else deadline - (time.perf_counter() - started)
+            message, nearest = offered(self.robot, guesses[0], verdict, sdf, config.validation, left)
+            result = _result(guesses[0], replace(verdict, message=message), [], started)
+            return replace(result, nearest_free=nearest)
+        if len(guesses[0]) < 3:
+            return _result(guesses[0], run.judge(guesses[0]), [], started)
         timer = time.perf_counter()
         best = _Best(guesses[0], run.judge(guesses[0])) if deadline is not None else None
         reserve = 1.3 * (time.perf_counter() - timer)  # a check takes about as long as the first one did
         late = _Deadline(started, deadline, reserve)
+        if best is not None and late():
+            return _result(best.trajectory, best.verdict, [], started)
 
         metric = Metric(len(guesses[0]), config.metric, free_goal=any(c.goal_only for c in constraints))
         workspace = Workspace(self.robot, sdf, config.eps, config.validation.workspace)
@@ -125,6 +132,7 @@ class Chomp:
             q = self._perturbed(q, metric, generator, objective)
         history: list[float] = []
         for attempt in range(config.max_tightenings + config.restarts + 1):
+            late.begin()
             descent = descend(
                 objective,
                 q,
@@ -135,6 +143,8 @@ class Chomp:
                 late,
             )
             best = run.best_of(descent, guesses, best, late)
+            if descent.blind.all() and not best.verdict.success:
+                best = _Best(best.trajectory, _without_gradient(best.verdict))
             if best.verdict.success or best.verdict.status is Status.INVALID_FIELD or late():
                 break
             if len(history) >= config.max_iterations or attempt == config.max_tightenings + config.restarts:
@@ -232,14 +242,33 @@ class _Run:
         return best
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Deadline:
+    """Whether another step would end too late; a step is taken to last as long as the longest one so far."""
+
     started: float
     seconds: float | None
     reserve: float
+    asked: float = math.inf
+    longest: float = 0.0
+
+    def begin(self) -> None:
+        """What was done until now was no step."""
+        self.asked = math.inf
 
     def __call__(self) -> bool:
-        return self.seconds is not None and time.perf_counter() - self.started >= self.seconds - self.reserve
+        now = time.perf_counter()
+        self.longest, self.asked = max(self.longest, now - self.asked), now
+        if self.seconds is None:
+            return False
+        return now - self.started + self.longest + self.reserve >= self.seconds
+
+
+def _without_gradient(verdict: Validation) -> Validation:
+    message = (
+        f"{verdict.message}; the field's gradient is NaN or infinite on the way, so nothing can be optimised"
+    )
+    return replace(verdict, status=Status.INVALID_FIELD, message=message)
 
 
 def _result(trajectory: Trajectory, verdict: Validation, history: list[float], started: float) -> PlanResult:

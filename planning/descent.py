@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from planning.objective import Objective
+from planning.objective import Evaluation, Objective
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,8 @@ class Descent:
     q: Float[Tensor, "b n dof"]
     total: Float[Tensor, " b"]
     free: Bool[Tensor, " b"]
+    blind: Bool[Tensor, " b"]
+    """Whether the objective or its gradient was not finite where the descent began, so that nothing could be done."""
 
     def order(self) -> list[int]:
         """The trajectories, the most promising first."""
@@ -71,18 +73,19 @@ def descend(
     best_q, best = q, now
     step = torch.full((len(q), 1, 1), config.step, dtype=q.dtype)
     polished = torch.zeros(len(q), dtype=torch.long)
-    active = torch.isfinite(now.total)
+    active = _finite(now)
+    blind = ~active
     totals: list[Tensor] = []
     while len(history) < max_iterations and active.any() and not late():
         history.append(float(now.total.nan_to_num(math.inf).min()))
         totals.append(now.total)
-        update = step * metric.solve(now.gradient)
+        update = step * metric.solve(now.gradient.where(active[:, None, None], 0.0))
         update *= (config.max_update / update.abs().amax(dim=1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0)
         candidate = q.clone()
         candidate[:, metric.interior] -= update
         candidate = settle(candidate)
         then = objective(candidate)
-        lower = (then.total < now.total) & active
+        lower = (then.total < now.total) & active & _finite(then)
         q = torch.where(lower[:, None, None], candidate, q)
         now = then.where(lower, now)
         step = torch.where(lower[:, None, None], 1.2 * step, 0.5 * step)
@@ -90,7 +93,11 @@ def descend(
         best_q, best = torch.where(better[:, None, None], q, best_q), now.where(better, best)
         polished += best.free
         active &= (polished < config.polish) & ~_plateau(totals, config)
-    return Descent(best_q, best.total, best.free)
+    return Descent(best_q, best.total, best.free, blind)
+
+
+def _finite(at: Evaluation) -> Bool[Tensor, " b"]:
+    return torch.isfinite(at.total) & torch.isfinite(at.gradient).all(dim=-1).all(dim=-1)
 
 
 def _plateau(totals: list[Tensor], config: DescentConfig) -> Bool[Tensor, " b"]:

@@ -17,6 +17,7 @@ MOST_SAMPLES = 100_000
 NODES = 20_000
 LONGER = 0.04  # [s] after which a path that was found is not bettered by looking for others
 MOTION_PER_METRE = 2.0  # edges of the compiled search are longer: the 1-norm overestimates motion
+SAMPLES_AT_ONCE, SHORTCUTS_AT_ONCE = 200, 50  # between two looks at the clock
 CHECKS = 0.1  # resolution of the last look at a path, relative to that of the search
 
 
@@ -40,7 +41,7 @@ def search(
         seed: of the samples.
         deadline: `time.perf_counter()` at which it ends.
     """
-    from planning.compiled.search import connect, length, shorten
+    from planning.compiled.search import length
     from planning.compiled.states import first_blocked
 
     rng = np.random.default_rng(seed)
@@ -59,9 +60,8 @@ def search(
             margin=world.margin * 0.5 ** (attempt // (2 * len(targets)) if best is None else 0)
         )
         reach = MOTION_PER_METRE * config.reach
-        path = connect(tight, ends[0], goal, rng, reach, resolution, NODES, samples)
-        if len(path):
-            path = shorten(tight, path, rng, resolution, config.shortcut_rounds)
+        path = _connected(tight, ends[0], goal, rng, reach, resolution, samples, deadline)
+        path = _shortened(tight, path, rng, resolution, config.shortcut_rounds, deadline)
         if len(path) and first_blocked(tight, path, CHECKS * config.resolution) < 0:
             found += 1
             if best is None or length(path) < length(best):
@@ -78,6 +78,35 @@ def search(
     if best is None:
         return NoPath(f"no path found in {config.seconds:g} s ({attempt + 1} attempts)")
     return torch.from_numpy(best).to(start)
+
+
+def _connected(world, start, goal, rng, reach, resolution, samples, deadline):  # type: ignore[no-untyped-def]
+    """A free path, straight if that is free; (0, dof) where the samples or the time were not enough."""
+    from planning.compiled.search import grow, planted
+    from planning.compiled.states import edge_free
+
+    path = np.empty((0, len(start)))
+    if time.perf_counter() > deadline:
+        return path
+    if edge_free(world, start, goal, resolution):
+        return np.stack([start, goal])
+    trees = planted(start, goal, NODES)
+    for _ in range(0, samples, SAMPLES_AT_ONCE):
+        path = grow(world, trees, rng, reach, resolution, SAMPLES_AT_ONCE)
+        if len(path) or time.perf_counter() > deadline:
+            break
+    return path
+
+
+def _shortened(world, path, rng, resolution, rounds, deadline):  # type: ignore[no-untyped-def]
+    """The path after random shortcuts, as many as there are rounds or time."""
+    from planning.compiled.search import shorten
+
+    for _ in range(0, rounds, SHORTCUTS_AT_ONCE):
+        if len(path) < 3 or time.perf_counter() > deadline:
+            break
+        path = shorten(world, path, rng, resolution, SHORTCUTS_AT_ONCE)
+    return path
 
 
 def _with_end_margins(shape: ExactShape, ends: np.ndarray, config: RrtConfig):  # type: ignore[no-untyped-def]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from typing import TypeGuard
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -69,7 +70,7 @@ def exact_shape(
 ) -> ExactShape | None:
     """The exact shape of a robot in a field, or None where one of them cannot be compiled, nor can unknown space."""
     field = sdf.field if isinstance(sdf, CostField) else sdf
-    if not isinstance(robot, CompilableRobot) or not isinstance(field, CompilableField):
+    if not _compilable(robot) or not isinstance(field, CompilableField):
         return None
     config = config or WorkspaceConfig()
     if config.unknown_confidence is not None:
@@ -77,15 +78,21 @@ def exact_shape(
     return ExactShape(robot, field, config.floor_tolerance)
 
 
+def _compilable(robot: SphereRobot) -> TypeGuard[CompilableRobot]:
+    """Whether a robot can be compiled; asking for all it offers takes a while, so known ones are not asked again."""
+    return robot in _bodies or isinstance(robot, CompilableRobot)
+
+
 def _compile(world) -> None:  # type: ignore[no-untyped-def]
     """Compile the search, or load it from numba's cache, before anybody looks at a clock."""
-    from planning.compiled.search import connect, length, shorten
-    from planning.compiled.states import first_blocked
+    from planning.compiled.search import grow, length, planted, shorten
+    from planning.compiled.states import edge_free, first_blocked
 
-    if connect.signatures:
+    if grow.signatures:
         return
     path = np.stack([0.5 * (world.low + world.high)] * 2)
-    connect(world, path[0], path[1], np.random.default_rng(0), 1.0, 1.0, 2, 1)
+    edge_free(world, path[0], path[1], 1.0)
+    grow(world, planted(path[0], path[1], 2), np.random.default_rng(0), 1.0, 1.0, 1)
     shorten(world, path, np.random.default_rng(0), 1.0, 1)
     first_blocked(world, path, 1.0)
     length(path)

@@ -45,7 +45,8 @@ class RrtConfig:
         max_nodes: nodes of both trees after which the search gives up.
         seconds: wall time [s] after which the search gives up.
         candidates: paths found and shortened, of which the shortest is taken; only where robot and field can be
-            compiled, since a path then costs milliseconds.
+            compiled, since a path then costs milliseconds. How many there is time for depends on the machine; with
+            one, the seed alone decides.
         workspace: rules for the floor and for unknown space, which counts as blocked.
     """
 

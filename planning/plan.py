@@ -12,15 +12,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from planning.chomp import Chomp, ChompConfig
-from planning.errors import ConfigError
+from planning.ends import check_ends, offered
+from planning.errors import ConfigError, TrajectoryError
 from planning.exact_shape import exact_shape
 from planning.initialise import NoPath, RrtConfig, rrt_connect
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
 from planning.trajectory import Trajectory
-from planning.validation import check, check_ends
+from planning.validation import check
 
 logger = logging.getLogger(__name__)
+
+SEARCH_SHARE = 0.6  # of the time left before a deadline; the rest is for smoothing and checking
 
 
 @dataclass(frozen=True)
@@ -74,11 +77,12 @@ class Planner:
             sdf: the field to keep clear of.
             warm_start: a trajectory to bend first, such as the last plan; its ends are replaced by start and
                 goal.
-            deadline: wall time [s] for the whole.
+            deadline: wall time [s] for the whole. The first plan of a process also loads or compiles kernels.
 
         Raises:
             TrajectoryError: if start, goal or warm start do not fit the robot.
         """
+        self._check(start, goal, warm_start)
         config, started = self.config, time.perf_counter()
 
         def left() -> float | None:
@@ -89,9 +93,10 @@ class Planner:
         verdicts = [check_ends(self.robot, line, sdf, config.chomp.validation) for line in lines]
         lines = [line for line, verdict in zip(lines, verdicts, strict=True) if verdict.success]
         if not lines:
-            seconds, first = time.perf_counter() - started, verdicts[0]
             line = Trajectory.line(start, goals[0], config.num_waypoints, config.duration)
-            return PlanResult(line, first.status, first.message, first.clearance, (), 0, seconds)
+            message, nearest = offered(self.robot, line, verdicts[0], sdf, config.chomp.validation, left())
+            seconds, first = time.perf_counter() - started, verdicts[0]
+            return PlanResult(line, first.status, message, first.clearance, (), 0, seconds, nearest)
         guesses = [self._warm(warm_start, line) for line in lines]
         chomp = Chomp(self.robot, config.chomp, self.seed)
         unaided = None
@@ -109,6 +114,21 @@ class Planner:
         result = self._smoothed(path, sdf, chomp, left())
         return replace(result, seconds=time.perf_counter() - started)
 
+    def _check(self, start: Tensor, goal: Tensor, warm_start: Trajectory | None) -> None:
+        """Raise a TrajectoryError where something does not fit the robot."""
+        joints = self.robot.joint_names
+        given = {"start": start, "goal": goal}
+        if warm_start is not None:
+            given["warm_start"] = warm_start.waypoints
+        for name, q in given.items():
+            if q.ndim == 0 or q.numel() == 0 or q.shape[-1] != len(joints):
+                raise TrajectoryError(
+                    f"Planner.plan: {name} has shape {tuple(q.shape)}, but the robot has {len(joints)} joints: "
+                    f"{', '.join(joints)}."
+                )
+            if not torch.isfinite(q).all():
+                raise TrajectoryError(f"Planner.plan: {name} must be finite, got {q.tolist()}.")
+
     def _search(
         self,
         start: Float[Tensor, " dof"],
@@ -116,12 +136,10 @@ class Planner:
         sdf: DistanceField | CostField,
         seconds: float | None,
     ) -> Float[Tensor, "k dof"] | NoPath:
-        """A free path to the first goal that a search reaches."""
-        rrt = (
-            self.config.rrt
-            if seconds is None
-            else replace(self.config.rrt, seconds=min(self.config.rrt.seconds, seconds))
-        )
+        """A free path to the first goal that a search reaches, in a share of the time that is left."""
+        rrt = self.config.rrt
+        if seconds is not None:
+            rrt = replace(rrt, seconds=min(rrt.seconds, SEARCH_SHARE * seconds))
         path: Float[Tensor, "k dof"] | NoPath = NoPath("no goal")
         for goal in goals:
             path = rrt_connect(

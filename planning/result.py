@@ -5,6 +5,9 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
+from jaxtyping import Float
+from torch import Tensor
+
 from planning.trajectory import Trajectory
 
 
@@ -35,6 +38,7 @@ class PlanResult:
         cost_history: total cost before each iteration of the optimiser.
         iterations: iterations of the optimiser.
         seconds: wall time [s].
+        nearest_free: where start or goal is blocked, the nearest configuration (dof,) found that is not.
     """
 
     trajectory: Trajectory
@@ -44,6 +48,7 @@ class PlanResult:
     cost_history: tuple[float, ...]
     iterations: int
     seconds: float
+    nearest_free: Float[Tensor, " dof"] | None = None
 
     @property
     def success(self) -> bool:

@@ -70,4 +70,6 @@ class CompiledKinematics(TorchKinematics):
 
 def kinematics_of(robot: SphereRobot) -> TorchKinematics:
     """The fastest kinematics that a robot offers."""
-    return CompiledKinematics(robot) if isinstance(robot, CompilableRobot) else TorchKinematics(robot)
+    if not isinstance(robot, CompilableRobot):
+        return TorchKinematics(robot)
+    return CompiledKinematics(robot)

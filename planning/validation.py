@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -142,25 +142,6 @@ def check(
     )
 
 
-def check_ends(
-    robot: SphereRobot,
-    trajectory: Trajectory,
-    sdf: DistanceField | CostField,
-    config: ValidationConfig | None = None,
-) -> Validation:
-    """Test the start and the goal only; what no optimiser can repair."""
-    check_dofs(robot, trajectory)
-    start, goal = (
-        check(robot, Trajectory(trajectory.waypoints[i : i + 1], trajectory.times[i : i + 1]), sdf, config)
-        for i in (0, len(trajectory) - 1)
-    )
-    if not start.success or goal.success:
-        return start
-    status = Status.GOAL_IN_COLLISION if goal.status is Status.START_IN_COLLISION else goal.status
-    message = "goal " + goal.message.removeprefix("at waypoint 0 of 1 ")
-    return replace(goal, status=status, message=message, waypoint=len(trajectory) - 1)
-
-
 def check_dofs(robot: SphereRobot, trajectory: Trajectory) -> None:
     """Raise a TrajectoryError if a trajectory does not fit a robot."""
     if trajectory.num_dofs != robot.num_dofs:
@@ -268,6 +249,14 @@ def _measure(
                 gaps.append(torch.full_like(depth, torch.inf))
                 worst.append(torch.zeros(len(part), 2, dtype=torch.long))
     return torch.cat(depths), torch.cat(spheres), torch.cat(gaps), torch.cat(worst)
+
+
+def free_states(
+    robot: SphereRobot, workspace: Workspace, states: Float[Tensor, "m dof"], config: ValidationConfig
+) -> Bool[Tensor, " m"]:
+    """Which states keep the margins from obstacles and from the robot itself; NaN in the field is not free."""
+    depth, _, gap, _ = _measure(robot, workspace, states, config)
+    return (depth >= config.margin) & (gap >= config.self_margin)
 
 
 def _limit_excess(robot: SphereRobot, states: Float[Tensor, "m dof"]) -> Float[Tensor, "m dof"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from numba import njit
@@ -13,35 +13,36 @@ from planning.compiled.states import World, edge_free, free, motion
 SHORTER = 0.25  # of an edge that is blocked is tried before it is given up
 
 
+class Trees(NamedTuple):
+    """Two trees of free configurations: `nodes` (2, m, dof), their `parents` (2, m), and how many there are (2,)."""
+
+    nodes: np.ndarray
+    parents: np.ndarray
+    sizes: np.ndarray
+
+
+def planted(start: np.ndarray, goal: np.ndarray, max_nodes: int) -> Trees:
+    """A tree at the start and one at the goal, each with room for `max_nodes`."""
+    nodes = np.empty((2, max_nodes, len(start)))
+    nodes[0, 0], nodes[1, 0] = start, goal
+    return Trees(nodes, np.zeros((2, max_nodes), np.int64), np.ones(2, np.int64))
+
+
 @njit(cache=True)
 @no_type_check
-def connect(
-    world: World,
-    start: np.ndarray,
-    goal: np.ndarray,
-    rng: np.random.Generator,
-    reach: float,
-    resolution: float,
-    max_nodes: int,
-    max_samples: int,
+def grow(
+    world: World, trees: Trees, rng: np.random.Generator, reach: float, resolution: float, samples: int
 ) -> np.ndarray:
-    """A free path (k, dof) from start to goal, both free; (0, dof) after `max_samples` in vain.
+    """A free path (k, dof) from one root to the other, both free; (0, dof) after so many samples in vain.
 
     Two trees grow in turn: one by an edge of at most `reach` (weighted length [m]) towards a sample, the other then
-    edge by edge towards what was added.
+    edge by edge towards what was added. Call again with the same trees to go on.
     """
-    dof = len(start)
-    if edge_free(world, start, goal, resolution):
-        path = np.empty((2, dof))
-        path[0], path[1] = start, goal
-        return path
-    nodes = np.empty((2, max_nodes, dof))
-    parents = np.zeros((2, max_nodes), np.int64)
-    nodes[0, 0], nodes[1, 0] = start, goal
-    sizes = np.array([1, 1])
+    nodes, parents, sizes = trees
+    dof, max_nodes = nodes.shape[2], nodes.shape[1]
     side = 0
     sample = np.empty(dof)
-    for _ in range(max_samples):
+    for _ in range(samples):
         for j in range(dof):
             sample[j] = world.low[j] + (world.high[j] - world.low[j]) * rng.random()
         if sizes[side] > sizes[1 - side]:  # grow the smaller tree: the other is in the open

@@ -1,3 +1,5 @@
+import time
+
 import pytest
 import torch
 
@@ -59,6 +61,25 @@ def test_no_path():
 def test_deadline_zero_comes_back_at_once_without_a_false_success():
     result = Planner(Disc()).plan(torch.tensor([1.0, 0.0]), torch.tensor([4.0, 0.5]), TRAP, deadline=0.0)
     assert result.status is Status.NO_PATH and result.seconds < 1.0
+
+
+@pytest.mark.parametrize("deadline", [0.1, 0.5, 2.0])
+@pytest.mark.parametrize("field", [TRAP, walls_round(4.0)], ids=["trap", "walls"])
+def test_a_deadline_is_kept_to_a_tenth(deadline, field, monkeypatch):
+    """By a clock that only the field moves on."""
+    now = [0.0]
+
+    class Ticking(Union):
+        def distance(self, points):
+            now[0] += 1e-3 + 5e-6 * points[..., 0].numel()
+            return super().distance(points)
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    start, goal = torch.tensor([1.0, 0.0]), torch.tensor([4.0, 0.1])
+    result = Planner(Disc()).plan(start, goal, Ticking(*field.parts), deadline=deadline)
+    assert result.seconds <= 1.1 * deadline
+    if field is TRAP and deadline >= 2.0:
+        assert result.success, result.message
 
 
 @pytest.mark.parametrize("end, status", [(0, Status.START_IN_COLLISION), (1, Status.GOAL_IN_COLLISION)])

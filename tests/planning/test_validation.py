@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from planning import Status, Trajectory, TrajectoryError, ValidationConfig, check
-from planning.validation import check_ends
+from planning.ends import check_ends
 from tests.planning.fields import Box, Confident, Cylinder, HingeCost, NanBeyond, Sphere
 from tests.planning.robots import Base, Disc, PlanarArm
 
