@@ -52,16 +52,13 @@ class GoalPose:
         relative = target[:3, :3].T @ pose[..., :3, :3]
         if self.free_axis is not None:
             across = [i for i in range(3) if i != self.free_axis]
-            turn = relative[..., across, self.free_axis]
-            behind = (
-                relative[..., self.free_axis, self.free_axis] < 0
-            )  # pointing the wrong way is no solution
-            turn = torch.where(
-                behind.unsqueeze(-1), turn / turn.norm(dim=-1, keepdim=True).clamp_min(1e-6), turn
+            turn = _sines(
+                relative[..., across, self.free_axis], relative[..., self.free_axis, self.free_axis]
             )
         else:
             twist = relative - relative.transpose(-1, -2)
             turn = 0.5 * torch.stack([twist[..., 2, 1], twist[..., 0, 2], twist[..., 1, 0]], dim=-1)
+            turn = _sines(turn, relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
         return torch.cat([offset, turn], dim=-1)
 
 
@@ -87,7 +84,15 @@ class AxisConstraint:
         first = torch.linalg.cross(self.direction.to(q), helper)
         first = first / first.norm()
         second = torch.linalg.cross(self.direction.to(q), first)
-        return turned @ torch.stack([first, second], dim=1)
+        return _sines(turned @ torch.stack([first, second], dim=1), turned @ self.direction.to(q))
+
+
+def _sines(sines: Float[Tensor, "m k"], cosine: Float[Tensor, " m"]) -> Float[Tensor, "m k"]:
+    """Sines of a turn, of length one beyond a right angle, so that the opposite direction is no solution."""
+    size = sines.norm(dim=-1, keepdim=True)
+    anywhere = torch.eye(sines.shape[-1]).to(sines)[0]  # at half a turn every way back is as good
+    unit = torch.where(size > 1e-6, sines / size.clamp_min(1e-6), anywhere)
+    return torch.where((cosine < 0).unsqueeze(-1), unit, sines)
 
 
 def linearised(
