@@ -59,7 +59,9 @@ def mapped(world: World, options: PlanArm) -> isdf.Mapper:
     mapper, noise, rng = isdf.Mapper(), DepthNoise(), np.random.default_rng(options.seed)
     for number, angle in enumerate(np.linspace(-2.6, 2.6, options.views)):
         frame = DepthCamera(world, T_link_camera=camera_pose(float(angle))).render()
-        mapper.integrate(isdf.DepthFrame(noise(frame.depth, rng), frame.T_world_camera, frame.camera, float(number)))
+        mapper.integrate(
+            isdf.DepthFrame(noise(frame.depth, rng), frame.T_world_camera, frame.camera, float(number))
+        )
     mapper.refresh()
     return mapper
 
