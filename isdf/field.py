@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .display import ShownField
 from .errors import ConfigError, IsdfError
 from .network import SDFNetwork
 
@@ -42,7 +43,7 @@ def check_points(points: Tensor) -> None:
         )
 
 
-class AnalyticField:
+class AnalyticField(ShownField):
     """Base of the fields that know their own gradient: what follows from `distance_and_gradient`.
 
     Attributes:
@@ -122,7 +123,7 @@ class GridField(AnalyticField):
 
     Args:
         values: (nx, ny, nz) signed distances [m].
-        origin: (3,) world position of values[0, 0, 0] [m].
+        origin: (3,) world position [m] of the first value.
         spacing: distance of grid points [m].
     """
 

@@ -13,22 +13,23 @@ from robots.kinematic_tree import parse_origin, read_urdf
 from robots.mesh_paths import resolve_mesh
 
 
-def collision_pieces(urdf: str | Path) -> dict[str, list[trimesh.Trimesh]]:
+def collision_pieces(urdf: str | Path, keep_concave: bool = False) -> dict[str, list[trimesh.Trimesh]]:
     """Convex pieces of every link that has collision geometry, in the link frame [m].
 
     A mesh is replaced by its convex hull, as rigid-body engines do, so that spheres covering the pieces
-    also cover what the engine collides.
+    also cover what the engine collides. With `keep_concave` those marked `<collision concave="yes">`, which
+    engines collide as they are, stay so.
     """
     robot = read_urdf(urdf)
     pieces: dict[str, list[trimesh.Trimesh]] = {}
     for link in robot.findall("link"):
-        found = [_piece(collision, urdf) for collision in link.findall("collision")]
+        found = [_piece(collision, urdf, keep_concave) for collision in link.findall("collision")]
         if found:
             pieces[link.get("name", "")] = found
     return pieces
 
 
-def _piece(collision: ElementTree.Element, urdf: str | Path) -> trimesh.Trimesh:
+def _piece(collision: ElementTree.Element, urdf: str | Path, keep_concave: bool) -> trimesh.Trimesh:
     geometry = collision.find("geometry")
     if geometry is None or len(geometry) == 0:
         raise UrdfError(f"{urdf}: a <collision> element has no geometry")
@@ -38,7 +39,9 @@ def _piece(collision: ElementTree.Element, urdf: str | Path) -> trimesh.Trimesh:
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_mesh()
         scale = np.array(shape.get("scale", "1 1 1").split(), dtype=float)
-        piece = trimesh.Trimesh(loaded.vertices * scale, loaded.faces).convex_hull
+        piece = trimesh.Trimesh(loaded.vertices * scale, loaded.faces)
+        if not (keep_concave and collision.get("concave") == "yes"):
+            piece = piece.convex_hull
     elif shape.tag == "box":
         piece = trimesh.creation.box(np.array(shape.get("size", "").split(), dtype=float))
     elif shape.tag == "cylinder":

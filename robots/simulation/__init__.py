@@ -4,6 +4,7 @@ from robots.simulation.base import DifferentialDrive, DriveConfig
 from robots.simulation.camera import DepthCamera, DepthFrame, PinholeCamera
 from robots.simulation.contacts import Contact
 from robots.simulation.depth_noise import DepthNoise, DepthNoiseConfig
+from robots.simulation.mesh_sdf import MeshField
 from robots.simulation.mobile_robot import SimulatedMobileRobot
 from robots.simulation.primitives import Box, Cylinder, Primitive, Sphere
 from robots.simulation.recording import Recording
@@ -25,6 +26,7 @@ __all__ = [
     "DifferentialDrive",
     "DriveConfig",
     "GraspTask",
+    "MeshField",
     "MotorConfig",
     "PinholeCamera",
     "Primitive",

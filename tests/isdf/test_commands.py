@@ -88,8 +88,24 @@ def test_faults_are_one_line_for_people_and_one_for_machines(
 def test_a_misspelled_option_is_answered_with_the_right_one(map_path, monkeypatch, capsys) -> None:
     code, _, error = run(monkeypatch, capsys, "map", "x", "--out", "y", "--steps-per-fram", 3)
     assert code == 2 and "--steps-per-frame" in error
-    code, _, error = run(monkeypatch, capsys, "exprt", map_path)
-    assert code == 2 and "map, query, export, info" in error
+    code, out, error = run(monkeypatch, capsys, "map", "x", "--out", "y", "--steps-per-fram", 3, "--json")
+    assert code == 2 and "--steps-per-frame" in json.loads(error)["message"] and out == ""
+
+
+@pytest.mark.parametrize(("word", "meant"), [("exprt", "export"), ("qeury", "query"), ("maps", "map")])
+def test_a_misspelled_command_is_answered_with_the_right_one(word, meant, monkeypatch, capsys) -> None:
+    code, _, error = run(monkeypatch, capsys, word, "x")
+    assert code == 2 and f"did you mean {meant}?" in error and "map, query, export, info" in error
+    code, _, error = run(monkeypatch, capsys, "zzz", "x")
+    assert code == 2 and "did you mean" not in error and "map, query, export, info" in error
+
+
+@pytest.mark.parametrize("words", [("--help",), ("map", "--help"), ("export", "--help"), ("info", "--help")])
+def test_help_fits_a_narrow_terminal(words, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    code, text, _ = run(monkeypatch, capsys, *words)
+    assert code == 0 and max(len(line) for line in text.splitlines()[2:]) <= 80
+    assert "None}|{" not in text and text.count("\n") < 110
 
 
 def test_newer_damaged_and_oversized_files_are_refused(map_path, tmp_path) -> None:
