@@ -59,7 +59,7 @@ class Options:
     mesh_spacing: float = 0.04
     """Cell size of the meshes [m]."""
     pictures: bool = True
-    """Draw slices and meshes, which takes half a minute a sequence."""
+    """Draw slices and meshes anew, which takes half a minute a sequence; without, a page keeps those drawn before."""
 
 
 def main(options: Options) -> list[Path]:
@@ -79,7 +79,7 @@ def main(options: Options) -> list[Path]:
         for name in tqdm(tables.sequences(results["main"]), desc="pictures", unit="sequence", disable=None):
             written += _pictures(options, report, name, results["main"])
     if options.publish:
-        _publish(options.publish, parts, [path for path in written if path.suffix == ".png"])
+        _publish(options.publish, parts, sorted(report.glob("*.png")))
     return written
 
 
