@@ -104,6 +104,7 @@ class ReplanningLoop:
         self.plan: PlanResult | None = None
         self.field: DistanceField | None = None
         self.report = DriveReport()
+        self.last_planning = 0.0
         self._frame: Any = None
         self._owed = self._held = self._started = 0.0
         self._failures, self._failed_at = 0, np.full(2, math.inf)
@@ -189,6 +190,7 @@ class ReplanningLoop:
         plan, spent = self.clock.charge(lambda: self._decide(goal))
         self.report.planning_seconds += spent
         if self.report.plans > plans:
+            self.last_planning = spent
             self.report.slowest_plan = max(self.report.slowest_plan, spent)
         return plan, spent
 
