@@ -34,7 +34,7 @@ def recheck(scene: Scene, states: Path, every: int = 1) -> dict[str, float]:
         names = [str(name) for name in data["object_names"]]
         for name in names:
             if name not in world.solids:  # a person, who came with the episode
-                world.add_body(Cylinder(name, planar_pose(0, 0, 5), 0.22, 1.7))
+                world.add_body(Cylinder(name, planar_pose(0.0, 0.0, 5.0), 0.22, 1.7))
         for index in range(0, len(data["time"]), every):
             robot.reset(data["joint_positions"][index])
             for name, pose in zip(names, data["object_poses"][index], strict=True):

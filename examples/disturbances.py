@@ -129,10 +129,15 @@ class SensorFault:
         """Nothing in the world changes."""
 
 
+PATIENCE = 1.5
+"""People wait about this long for a robot in their way [s]."""
+
+
 class People:
     """Cylinders as large as people walk to and fro between free places.
 
-    Like people they do not walk into what stands in their way: they wait while the robot is closer than `courtesy`.
+    Like people they do not walk into what stands in their way: they wait while the robot is closer than `courtesy`, and
+    after a while go elsewhere.
 
     Args:
         free: (n, 2) places [m] with room for a person, a grid.
@@ -169,9 +174,10 @@ class People:
             robot.world.set_object_pose(name, planar_pose(*self._places[i], self.HEIGHT / 2))
 
     def _enter(self, robot: SimulatedMobileRobot, here: Planar) -> None:
-        far = self._free[np.linalg.norm(self._free - here, axis=1) > 2.0]
         for name in self.names:
-            place = far[self._rng.integers(len(far))]
+            apart = np.linalg.norm(self._free[:, None] - np.array([here, *self._places]), axis=2).min(axis=1)
+            far = np.flatnonzero(apart > min(2.0, 0.8 * apart.max()))
+            place = self._free[self._rng.choice(far)]
             self._places.append(place)
             pose = planar_pose(*place, self.HEIGHT / 2)
             robot.world.add_body(Cylinder(name, pose, self.RADIUS, self.HEIGHT, colour=(0.8, 0.5, 0.3)))
@@ -185,7 +191,11 @@ class People:
             apart = min((float(np.linalg.norm(there - p)) for p in others), default=np.inf)
             if np.linalg.norm(self._free - there, axis=1).min() <= self._step and apart > 3 * self.RADIUS:
                 gap, before = (float(np.linalg.norm(p - robot)) - self.RADIUS for p in (there, place))
-                return place if gap < min(before, self.courtesy) else there
+                if gap >= min(before, self.courtesy):
+                    return there
+                if self._rng.random() < duration / PATIENCE:
+                    self._headings[i] += self._rng.uniform(0.5, 2.5)
+                return place
             self._headings[i] += self._rng.uniform(0.5, 2.5)
         return place
 
