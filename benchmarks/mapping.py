@@ -12,18 +12,17 @@ Every run leaves a JSON file in OUT/EXPERIMENT; `python -m benchmarks.mapping_re
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
-from joblib import Parallel, delayed, parallel_config
+from joblib import Parallel, delayed
 from tqdm import tqdm
 
 if not __package__:  # run as a file
@@ -31,12 +30,13 @@ if not __package__:  # run as a file
 
 from benchmarks.experiments import EXPERIMENTS, REAL, REGION_OF, Experiment, Job
 from benchmarks.runs import REAL_FPS, Study, prepare, run, write_json
+from benchmarks.workers import Workers, at_work
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(Workers):
     """Run mapping experiments on recorded sequences with known truth."""
 
     experiments: tyro.conf.Positional[tuple[Experiment, ...]]
@@ -61,12 +61,6 @@ class Options:
     """Evaluation points at each time."""
     period: float = 5.0
     """Sequence time between evaluations [s]."""
-    jobs: int = 1
-    """Runs at a time; each uses one core."""
-    backend: Literal["loky", "dask", "ray"] = "loky"
-    """Local processes, or a Dask or Ray cluster (packages `distributed`, `ray`) that sees the same folders."""
-    cluster: str | None = None
-    """Address of the cluster's scheduler; by default a local one is started."""
 
 
 def main(options: Options) -> list[str]:
@@ -81,7 +75,7 @@ def main(options: Options) -> list[str]:
     )
     _check_same_study(study)
     jobs = [job for name in options.experiments for job in _jobs(study, options, name)]
-    with cluster(options):
+    with at_work(options):
         known = sorted({job.sequence for job in jobs if job.experiment != REAL})
         failed = _in_parallel("evaluation points", options, prepare, [(study, name) for name in known])
         # Its mapped region must be known before the others are judged in it.
@@ -146,46 +140,6 @@ def _attempt(work: Callable[..., Any], study: Study, task: Any) -> str | None:
         logger.debug("failed", exc_info=True)
         return f"{getattr(task, 'key', task)}: {type(error).__name__}: {error}"
     return None
-
-
-@contextlib.contextmanager
-def cluster(options: Options) -> Iterator[None]:
-    """Make joblib send its work where the options say."""
-    if options.backend == "loky":
-        # BLAS and numba of the workers get one thread each.
-        with parallel_config(backend="loky", **({"inner_max_num_threads": 1} if options.jobs > 1 else {})):
-            yield
-        return
-    try:
-        start = _start_dask if options.backend == "dask" else _start_ray
-        with start(options), parallel_config(backend=options.backend):
-            yield
-    except ImportError as error:
-        raise SystemExit(
-            f"--backend {options.backend} needs a package that is not installed ({error}); "
-            f"pip install -e '.[cluster]' for Dask, `pip install ray` for Ray"
-        ) from error
-
-
-def _start_dask(options: Options) -> contextlib.AbstractContextManager:
-    from distributed import Client, LocalCluster
-
-    if options.cluster:
-        return Client(options.cluster)
-    return Client(LocalCluster(n_workers=options.jobs, threads_per_worker=1, dashboard_address=None))
-
-
-@contextlib.contextmanager
-def _start_ray(options: Options) -> Iterator[None]:
-    import ray
-    from ray.util.joblib import register_ray
-
-    ray.init(address=options.cluster, num_cpus=None if options.cluster else options.jobs)
-    register_ray()
-    try:
-        yield
-    finally:
-        ray.shutdown()
 
 
 if __name__ == "__main__":

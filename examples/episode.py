@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,15 @@ import torch
 
 import isdf
 import robots
+from examples.disturbances import Disturbance, DisturbedRobot
+from examples.maps import Method, TrueMap, mean_error, new_map
+from isdf.mapping.field import LatticeField
 from planning.clock import Clock, FixedClock, MeasuredClock
+from planning.collision_monitor import CollisionMonitor, Spheres
 from planning.protocols import DistanceField
 from robots.simulation import DepthNoise, Scene, SimulatedMobileRobot, World, load_urdf_scene, make_scene
 
-# Robots are shorter than this [m]: space above it need not be baked for planning a path of the base.
+# The robot is lower than this [m]: space above it need not be baked for planning a path of the base.
 ROBOT_HEIGHT = 1.45
 
 
@@ -30,6 +35,8 @@ class EpisodeOptions:
     """Shifts the furniture, picks start and goal, and seeds map, noise and search."""
     noise: bool = True
     """Give the depth camera the noise of a real one."""
+    method: Method = "default"
+    """The map to drive by; `truth` knows the world beforehand."""
     fixed_cost: bool = False
     """Charge fixed times for computing instead of measured CPU time, so that runs repeat exactly."""
 
@@ -44,11 +51,19 @@ class Episode:
     Args:
         options: scene, seed and noise.
         start: base pose x, y [m], yaw [rad]; the scene's own if None.
+        disturbances: what makes the episode harder.
+        scene: instead of the one that the options name.
     """
 
-    def __init__(self, options: EpisodeOptions, start: tuple[float, float, float] | None = None) -> None:
+    def __init__(
+        self,
+        options: EpisodeOptions,
+        start: tuple[float, float, float] | None = None,
+        disturbances: Sequence[Disturbance] = (),
+        scene: Scene | None = None,
+    ) -> None:
         self.options = options
-        self.scene = chosen_scene(options)
+        self.scene = scene or chosen_scene(options)
         start = start or self.scene.start
         if start is None:
             raise SystemExit(f"{options.scene} has no start of its own: give --start X Y YAW")
@@ -57,17 +72,37 @@ class Episode:
         q[:3] = start
         self.world = World(self.scene)
         noise = DepthNoise() if options.noise else None
-        self.robot = SimulatedMobileRobot(self.world, self.model, q, noise=noise, seed=options.seed)
+        simulated = SimulatedMobileRobot(self.world, self.model, q, noise=noise, seed=options.seed)
+        self.robot = DisturbedRobot(simulated, disturbances)
         self.body = robots.SweptBase(self.model, torch.as_tensor(q, dtype=torch.float32))
-        # The loop decides when to train, so taking in a frame does not.
-        untimed = {"first_frame_steps": 0, "steps_per_frame": 0, "keyframe_steps": 0}
-        self.mapper = isdf.IsdfMapper(replace(isdf.IsdfConfig(seed=options.seed), **untimed))
+        self.mapper = new_map(options.method, options.seed, self.world)
+        self.monitor = CollisionMonitor(self.spheres)
+
+    def spheres(self) -> Spheres:
+        """The robot's spheres where they are now: centres (s, 3) and radii (s,) [m]."""
+        centres, radii = self.model.spheres(torch.as_tensor(self.robot.posture(), dtype=torch.float32))
+        return centres.double().numpy(), radii.double().numpy()
 
     def field_for_driving(self) -> DistanceField:
-        """The map up to the robot's height, baked for fast queries."""
+        """The map, baked up to the robot's height where its own queries are slow."""
+        field = self.mapper.field()
+        if isinstance(field, LatticeField):
+            return field
         bounds = self.mapper.bounds
         bounds[0, 2], bounds[1, 2] = 0.0, ROBOT_HEIGHT
-        return self.mapper.field().bake(0.08, bounds, padding=0.1)
+        return isdf.bake(field, bounds, 0.08, 0.1)
+
+    def map_report(self) -> dict:
+        """What a report says of the map: method, steps, and its error where the truth is known."""
+        mapper = self.mapper
+        known = bool(self.world.solids) and self.scene.urdf_path is None and mapper.frames_seen > 0
+        error = mean_error(mapper.field(), self.world.field(), mapper.bounds) if known else None
+        return {"method": self.options.method, "steps": mapper.steps, "sdf_error": error}
+
+    def save_map(self, path: Path) -> None:
+        """Write the map to a file; the ground truth has none."""
+        if not isinstance(self.mapper, TrueMap):
+            self.mapper.save(path)
 
     def contacts(self) -> dict[str, float]:
         """True contacts of the robot with the world so far, as "link - body": depth [m]."""

@@ -18,6 +18,7 @@ import torch
 import tyro
 from tqdm import tqdm
 
+import isdf
 from examples.arm import Grasp, execute, grasp_candidates, parked, plan_reach, within_limits
 from examples.episode import Episode, EpisodeOptions, chosen_scene
 from examples.pictures import Film, save_map_picture
@@ -88,6 +89,7 @@ class GraspEpisode:
             self.clock,
             lambda loop: self.film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy()),
             self.options.seed,
+            episode.monitor,
         )
         self.drive = loop.drive_to(np.array(self.task.park[:2]), final_yaw=self.task.park[2])
         return self.drive.success
@@ -135,7 +137,7 @@ class GraspEpisode:
         """The map round the robot and the table, baked finely."""
         x, y, _ = self.episode.robot.base_state()
         bounds = torch.tensor([[x - 1.1, y - 1.1, 0.0], [x + 1.1, y + 1.1, 1.6]])
-        return self.episode.mapper.field().bake(0.03, bounds)
+        return isdf.bake(self.episode.mapper.field(), bounds, 0.03)
 
     def take(self, grasp: Grasp, reach: torch.Tensor) -> None:
         """Reach, approach, close, lift and hold."""
@@ -200,13 +202,13 @@ def main(options: GraspOptions) -> dict:
         "contact_pairs": contacts,
         "drive": dataclasses.asdict(drive) | {"status": drive.status.value},
         "planning_seconds": grasping.planning_seconds,
-        "map": {"steps": episode.mapper.steps, "keyframes": len(episode.mapper.keyframes)},
+        "map": episode.map_report(),
         "robot_seconds": episode.robot.time,
         "wall_seconds": time.perf_counter() - started,
     }
     options.out.mkdir(parents=True, exist_ok=True)
     episode.robot.recording.save(options.out / "states.npz")
-    episode.mapper.save(options.out / "map.safetensors")
+    episode.save_map(options.out / "map.safetensors")
     save_map_picture(options.out / "map.png", episode, np.array(grasping.task.park))
     if options.film:
         grasping.film.save(options.out / "episode.gif")

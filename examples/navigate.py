@@ -49,9 +49,7 @@ def main(options: Navigate) -> dict:
         def watch(loop: ReplanningLoop) -> None:
             film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy())
             left = np.linalg.norm(episode.robot.base_state()[:2] - goal)
-            bar.set_postfix_str(
-                f"t = {episode.robot.time:.0f} s, {left:.1f} m to go, {episode.mapper.steps} steps"
-            )
+            bar.set_postfix_str(f"t = {episode.robot.time:.0f} s, {left:.1f} m to go")
             bar.update()
 
         loop = ReplanningLoop(
@@ -63,6 +61,7 @@ def main(options: Navigate) -> dict:
             options.clock(),
             watch,
             options.seed,
+            episode.monitor,
         )
         drive = loop.drive_to(goal)
     report = _report(options, episode, goal, drive, time.perf_counter() - started)
@@ -86,33 +85,16 @@ def _report(
         "straight_line": float(np.linalg.norm(start[:2] - goal)),
         "goal": goal.tolist(),
         "drive": dataclasses.asdict(drive) | {"status": drive.status.value},
-        "map": {
-            "steps": episode.mapper.steps,
-            "keyframes": len(episode.mapper.keyframes),
-            "sdf_error": _map_error(episode),
-        },
+        "map": episode.map_report(),
         "wall_seconds": wall_seconds,
     }
-
-
-def _map_error(episode: Episode) -> dict[str, float] | None:
-    """Mean and 95th percentile of |learned - true| distance [m] in the free space a robot moves in."""
-    if not episode.world.solids:
-        return None
-    low, high = episode.mapper.bounds
-    generator = torch.Generator().manual_seed(0)
-    points = low + (high - low) * torch.rand(20_000, 3, generator=generator)
-    truth = episode.world.field().distance(points)
-    free = (truth > 0) & (points[:, 2] > 0) & (points[:, 2] < 1.5)
-    error = (episode.mapper.field().distance(points[free]) - truth[free]).abs()
-    return {"mean": float(error.mean()), "p95": float(error.quantile(0.95))}
 
 
 def _write(options: Navigate, episode: Episode, film: Film, goal: np.ndarray, report: dict) -> None:
     out = options.out
     out.mkdir(parents=True, exist_ok=True)
     episode.robot.recording.save(out / "states.npz")
-    episode.mapper.save(out / "map.safetensors")
+    episode.save_map(out / "map.safetensors")
     zero_level_mesh(episode.mapper.field(), 0.05).export(out / "mesh.ply")
     save_map_picture(out / "map.png", episode, goal)
     if options.film:
@@ -126,7 +108,8 @@ def headline(report: dict) -> str:
     verdict = "Reached the goal" if report["success"] else f"Did not reach the goal ({drive['message']})"
     return (
         f"{verdict}: {drive['path_length']:.1f} m driven in {drive['duration']:.0f} s, {report['contacts']} contacts, "
-        f"{drive['plans']} plans, {report['map']['steps']} training steps."
+        f"{drive['plans']} plans, slowed or stopped by the collision monitor for "
+        f"{0.1 * (drive['slowed'] + drive['stopped'] + drive['blind']):.1f} s."
     )
 
 

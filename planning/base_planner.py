@@ -27,6 +27,7 @@ class BasePlannerConfig:
         num_waypoints: of a plan.
         margin: clearance [m] that plans keep where the map has a route with as much.
         clearance_change: a plan is no longer good when the map has taken this much [m] of its clearance.
+        off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
         looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
     """
 
@@ -39,14 +40,19 @@ class BasePlannerConfig:
     num_waypoints: int = 40
     margin: float = 0.05
     clearance_change: float = 0.05
+    off_path: float = 0.25
     looks: int = 3
 
     def __post_init__(self) -> None:
         low = self.num_waypoints < 3 or self.looks < 1
-        if low or not self.clearance_change > 0 or not self.margin >= self.search.least_margin:
+        if (
+            low
+            or not min(self.clearance_change, self.off_path) > 0
+            or not self.margin >= self.search.least_margin
+        ):
             raise ConfigError(
-                "BasePlannerConfig: clearance_change must be positive, num_waypoints at least 3, looks at least 1 and "
-                f"margin at least search.least_margin, got {self}."
+                "BasePlannerConfig: clearance_change and off_path must be positive, num_waypoints at least 3, looks at "
+                f"least 1 and margin at least search.least_margin, got {self}."
             )
 
 
@@ -114,6 +120,8 @@ class BasePlanner:
         """Whether what is left of a plan from where the base stands [m] keeps its clearance on a new map."""
         waypoints = plan.trajectory.waypoints
         nearest = int((waypoints - position).norm(dim=1).argmin())
+        if _gap(waypoints[max(0, nearest - 1) : nearest + 2], position) > self.config.off_path:
+            return False
         left = Trajectory.through(torch.cat([position[None], waypoints[nearest + 1 :]]))
         clearance = check(self.body, left, sdf, self.config.chomp.validation).clearance
         return clearance >= min(self.config.margin, plan.clearance) - self.config.clearance_change
@@ -156,3 +164,12 @@ class BasePlanner:
         entries = torch.stack(self._entries)
         visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
         return entries[visits >= self.config.looks]
+
+
+def _gap(path: Float[Tensor, "k 2"], position: Float[Tensor, "2"]) -> float:
+    """Distance [m] of a position to a polyline."""
+    if len(path) == 1:
+        return float((path[0] - position).norm())
+    start, step = path[:-1], path.diff(dim=0)
+    share = ((position - start) * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(1e-12)
+    return float((start + share.clamp(0, 1)[:, None] * step - position).norm(dim=1).min())

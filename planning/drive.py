@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from numpy import ndarray
+
+MOST_EVENTS = 100
 
 
 @runtime_checkable
@@ -47,7 +49,11 @@ class DriveStatus(enum.Enum):
 
 @dataclass
 class DriveReport:
-    """What happened on a drive. Times in seconds, lengths in metres."""
+    """What happened on a drive. Times in seconds, lengths in metres.
+
+    `slowed`, `stopped` and `blind` count the control periods in which the collision monitor changed the command, and
+    `events` says what interrupted the drive and when: at most `MOST_EVENTS` lines.
+    """
 
     status: DriveStatus = DriveStatus.TIME_LIMIT
     message: str = ""
@@ -62,8 +68,17 @@ class DriveReport:
     mapping_seconds: float = 0.0
     planning_seconds: float = 0.0
     slowest_plan: float = 0.0
+    slowed: int = 0
+    stopped: int = 0
+    blind: int = 0
+    events: list[str] = field(default_factory=list)
 
     @property
     def success(self) -> bool:
         """True if the goal was reached."""
         return self.status is DriveStatus.REACHED
+
+    def note(self, time: float, event: str) -> None:
+        """Add an event at a time [s] of the drive."""
+        if len(self.events) < MOST_EVENTS:
+            self.events.append(f"{time:.1f} s: {event}")

@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from numpy import ndarray
 
 from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.clock import Clock, MeasuredClock, OnlineMap
+from planning.collision_monitor import CollisionMonitor
 from planning.drive import DriveReport, DriveStatus, MobileRobot
 from planning.errors import ConfigError
 from planning.protocols import DistanceField, SphereRobot
@@ -25,6 +27,9 @@ from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
 
 logger = logging.getLogger(__name__)
+
+# The base has made progress since a failure when it is this far from where it stood then [m].
+PROGRESS = 0.1
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,8 @@ class ReplanningConfig:
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
         look_ahead: distance along the path [m] at which the camera looks.
-        patience: plans in a row that may fail before the goal is called unreachable.
+        stuck: the plan is given up when the collision monitor has held the base for this long [s].
+        patience: plans that may fail, or not be followed, without progress before the goal is called unreachable.
         time_limit: [s] of the robot's time.
     """
 
@@ -48,14 +54,15 @@ class ReplanningConfig:
     scan_rate: float = 0.5
     retry: float = 1.0
     look_ahead: float = 1.5
+    stuck: float = 2.0
     patience: int = 15
     time_limit: float = 180.0
 
     def __post_init__(self) -> None:
-        if not min(self.scan_rate, self.retry, self.time_limit) > 0:
+        if not min(self.scan_rate, self.retry, self.stuck, self.time_limit) > 0:
             raise ConfigError(
-                f"ReplanningConfig: scan_rate, retry and time_limit must be positive, got {self.scan_rate:g} rad/s, "
-                f"{self.retry:g} s and {self.time_limit:g} s."
+                "ReplanningConfig: scan_rate, retry, stuck and time_limit must be positive, got "
+                f"{self.scan_rate:g} rad/s, {self.retry:g} s, {self.stuck:g} s and {self.time_limit:g} s."
             )
 
 
@@ -74,6 +81,7 @@ class ReplanningLoop:
         clock: what computing costs.
         watch: called with the loop after every round, for pictures.
         seed: of the path search.
+        monitor: has the last word on every command of the base; it sees an image each control period.
     """
 
     def __init__(
@@ -86,17 +94,20 @@ class ReplanningLoop:
         clock: Clock | None = None,
         watch: Callable[[ReplanningLoop], None] | None = None,
         seed: int = 0,
+        monitor: CollisionMonitor | None = None,
     ) -> None:
         self.robot, self.mapper, self.snapshot = robot, mapper, snapshot
         self.config, self.clock = config or ReplanningConfig(), clock or MeasuredClock()
-        self.watch = watch
+        self.watch, self.monitor = watch, monitor
         self.planner = BasePlanner(body, self.config.planner, seed)
         self.tracker = BaseTracker(self.config.tracker)
         self.plan: PlanResult | None = None
         self.field: DistanceField | None = None
         self.report = DriveReport()
-        self._owed = 0.0
-        self._failures = 0
+        self.last_planning = 0.0
+        self._frame: Any = None
+        self._owed = self._held = self._started = 0.0
+        self._failures, self._failed_at = 0, np.full(2, math.inf)
         self._retry_at = -math.inf
         self._to_goal = False
         self._mapped = False
@@ -109,7 +120,8 @@ class ReplanningLoop:
             final_yaw: heading to end with [rad]; any if None.
         """
         started, self.report, self.plan = self.robot.time, DriveReport(), None
-        self._failures, self._retry_at, self._to_goal = 0, -math.inf, False
+        self._started = started
+        self._failures, self._retry_at, self._to_goal, self._held = 0, -math.inf, False, 0.0
         self.planner.forget()
         self._scan()
         self.tracker.reset()
@@ -118,7 +130,7 @@ class ReplanningLoop:
             leads_to_goal = self.plan is not None and self._to_goal
             fresh, planning = self._plan_if_needed(goal)
             self._follow(spent + planning, final_yaw)
-            self.plan = fresh
+            self.plan = None if self._stuck() else fresh
             self.report.rounds += 1
             if self.watch:
                 self.watch(self)
@@ -148,9 +160,9 @@ class ReplanningLoop:
 
     def _sense_and_map(self) -> float:
         """Give the newest frame to the map and train; returns the time it took."""
+        frame, self._frame = self._frame or self.robot.observe(), None
 
         def integrate() -> None:
-            frame = self.robot.observe()
             if frame is None:
                 return
             try:
@@ -178,6 +190,7 @@ class ReplanningLoop:
         plan, spent = self.clock.charge(lambda: self._decide(goal))
         self.report.planning_seconds += spent
         if self.report.plans > plans:
+            self.last_planning = spent
             self.report.slowest_plan = max(self.report.slowest_plan, spent)
         return plan, spent
 
@@ -194,13 +207,12 @@ class ReplanningLoop:
         fresh = self.planner.plan(start, end, self.field)
         self.report.plans += 1
         if fresh.usable:
-            self._failures, self._to_goal, self.report.message = 0, fresh.reaches_goal, ""
+            # A plan that the base cannot begin to follow is as good as none.
+            gone = float(np.linalg.norm(self.robot.base_state()[:2] - self._failed_at))
+            self._failures = 0 if gone > PROGRESS else self._failures
+            self._to_goal, self.report.message = fresh.reaches_goal, ""
             return fresh.result
-        self._failures += 1
-        self._retry_at = self.robot.time + self.config.retry
-        self.report.failed_plans += 1
-        self.report.message = fresh.reason
-        logger.info("no plan: %s", fresh.reason)
+        self._give_up_plan(fresh.reason)
         return None
 
     def _follow(self, duration: float, final_yaw: float | None) -> None:
@@ -223,10 +235,45 @@ class ReplanningLoop:
         self._owed += duration
         for _ in range(max(1, int(self._owed / period))):
             before = self.robot.base_state()
-            self.robot.drive(*command(before), period)
+            self.robot.drive(*self._monitored(before, *command(before)), period)
             self.report.path_length += float(np.linalg.norm(self.robot.base_state()[:2] - before[:2]))
             self._owed -= period
         self._owed = max(0.0, self._owed)
+
+    def _monitored(self, state: ndarray, v: float, omega: float) -> tuple[float, float]:
+        """The command that the collision monitor lets pass."""
+        if self.monitor is None:
+            return v, omega
+        self._frame = self.robot.observe()
+        self.monitor.see(self._frame)
+        seen, before = self.monitor.interventions, self.monitor.slowing
+        sent = self.monitor.limit(state, v, omega, self.robot.time)
+        if self.monitor.slowing and not before:
+            self.report.note(self.robot.time - self._started, seen.reason)
+        if sent != (v, omega):
+            self.tracker.overruled(*sent)
+        held = (v, omega) != (0.0, 0.0) and sent == (0.0, 0.0)
+        self._held = self._held + self.config.tracker.period if held else 0.0
+        self.report.slowed, self.report.stopped, self.report.blind = seen.slowed, seen.stopped, seen.blind
+        return sent
+
+    def _stuck(self) -> bool:
+        """Whether the plan was given up because the collision monitor does not let the base follow it."""
+        if self.monitor is None or self._held < self.config.stuck:
+            return False
+        self._give_up_plan(f"the collision monitor held the base: {self.monitor.interventions.reason}")
+        return True
+
+    def _give_up_plan(self, reason: str) -> None:
+        """Stand without a plan until it is time for the next attempt."""
+        self.plan, self._held = None, 0.0
+        self._failures += 1
+        self._failed_at = self.robot.base_state()[:2]
+        self._retry_at = self.robot.time + self.config.retry
+        self.report.failed_plans += 1
+        self.report.message = reason
+        self.report.note(self.robot.time - self._started, reason)
+        logger.info("no plan: %s", reason)
 
     def _look_along(self, path: Float[ndarray, "n 2"], state: ndarray) -> None:
         """Look at the floor where the path will lead, or ahead where it ends."""

@@ -148,6 +148,10 @@ class BaseTracker:
             return self._send(self._on_the_spot(heading))
         return self._send(self._optimal(state, reference))
 
+    def overruled(self, v: float, omega: float) -> None:
+        """Go on from (v [m/s], omega [rad/s]), which was sent in the place of the last command."""
+        self._last = np.array([v, omega])
+
     def _follow(self, path: Float[ndarray, "n 2"], times: Float[ndarray, " n"] | None) -> PathReference:
         key = (path.tobytes(), None if times is None else times.tobytes())
         if self._reference is None or key != self._key:

@@ -236,6 +236,10 @@ class World:
             raise SceneError(f"no solid named {name!r} in the world; there are {sorted(self._bodies)}")
         return self._bodies[name]
 
+    def name_of(self, body: int, link: int = -1) -> str:
+        """Name of a solid, or of a link of the scene's URDF, by pybullet's numbers."""
+        return self._names[body][link]
+
     def _load_scene(self, path: Path) -> int:
         try:
             body = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=self.client)

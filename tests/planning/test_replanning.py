@@ -252,6 +252,7 @@ def test_an_empty_report_is_no_success() -> None:
     [
         {"scan_rate": 0.0},
         {"retry": -1.0},
+        {"stuck": 0.0},
         {"time_limit": 0.0},
     ],
 )
@@ -261,7 +262,8 @@ def test_bad_settings_are_refused(values: dict) -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [{"clearance_change": 0.0}, {"num_waypoints": 2}, {"margin": -0.2}, {"looks": 0}]
+    "values",
+    [{"clearance_change": 0.0}, {"off_path": 0.0}, {"num_waypoints": 2}, {"margin": -0.2}, {"looks": 0}],
 )
 def test_bad_planner_settings_are_refused(values: dict) -> None:
     with pytest.raises(ConfigError, match="BasePlannerConfig"):

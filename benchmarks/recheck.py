@@ -1,0 +1,56 @@
+"""Contacts of a recorded episode, found anew: its states are put into a fresh world and measured there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pybullet
+
+import robots
+from robots.simulation import Cylinder, Scene, World
+from robots.simulation.poses import planar_pose
+
+TOUCH = 0.0005
+"""Bodies that overlap by less than this [m] only touch in passing: the physics' own tolerance."""
+
+
+def recheck(scene: Scene, states: Path, every: int = 1) -> dict[str, float]:
+    """Deepest overlap [m] of each pair "link - body" over the recorded states.
+
+    Args:
+        scene: the one that the episode ran in.
+        states: its states.npz.
+        every: looks at one state in so many.
+    """
+    with np.load(states) as saved:
+        data = {key: saved[key] for key in saved.files}
+    model = robots.load("tiago")
+    deepest: dict[str, float] = {}
+    with World(scene) as world:
+        robot = world.add_robot(
+            model.urdf_path, model.joint_names, data["joint_positions"][0], gripper=model.gripper
+        )
+        names = [str(name) for name in data["object_names"]]
+        for name in names:
+            if name not in world.solids:  # a person, who came with the episode
+                world.add_body(Cylinder(name, planar_pose(0.0, 0.0, 5.0), 0.22, 1.7))
+        for index in range(0, len(data["time"]), every):
+            robot.reset(data["joint_positions"][index])
+            for name, pose in zip(names, data["object_poses"][index], strict=True):
+                world.set_object_pose(name, pose)
+            pybullet.performCollisionDetection(physicsClientId=world.client)
+            for pair, depth in _overlaps(world).items():
+                deepest[pair] = max(deepest.get(pair, 0.0), depth)
+    return deepest
+
+
+def _overlaps(world: World) -> dict[str, float]:
+    found: dict[str, float] = {}
+    client, robot = world.client, world.robot
+    for point in pybullet.getContactPoints(bodyA=robot.body, physicsClientId=client):
+        if point[2] == robot.body or -point[8] <= TOUCH:
+            continue
+        pair = f"{robot.link_names[point[3]]} - {world.name_of(point[2], point[4])}"
+        found[pair] = max(found.get(pair, 0.0), float(-point[8]))
+    return found
