@@ -65,6 +65,8 @@ class Options(Workers):
 
 def main(options: Options) -> list[str]:
     """Run what is not there yet; returns what failed."""
+    if not options.experiments:
+        raise SystemExit(f"name one experiment or more: {', '.join(EXPERIMENTS)}")
     data = options.data or (Path(os.environ["ISDF_DATA_DIR"]) if "ISDF_DATA_DIR" in os.environ else None)
     study = Study(
         options.sequences.resolve(),

@@ -116,10 +116,10 @@ def test_a_run_that_dies_while_writing_leaves_nothing(study, monkeypatch) -> Non
 
 def options(recorded, tmp_path, **changes) -> mapping.Options:
     plain = mapping.Options(
-        ("bounds",),
-        recorded,
-        None,
-        tmp_path / "out",
+        experiments=("bounds",),
+        sequences=recorded,
+        data=None,
+        out=tmp_path / "out",
         methods=("isdf batch", "isdf ray"),
         points=200,
         period=1.6,
@@ -169,6 +169,7 @@ def test_a_missing_cluster_package_is_named(recorded, tmp_path, monkeypatch) -> 
         ({"only": ("hall",)}, "no sequence hall.*only room"),
         ({"methods": ("octomap",)}, "isdf batch.*not octomap"),
         ({"experiments": ("real",)}, "ISDF_DATA_DIR"),
+        ({"experiments": ()}, "name one experiment.*fidelity"),
     ],
 )
 def test_wrong_options_say_what_there_is(recorded, tmp_path, changes, words, monkeypatch) -> None:
