@@ -11,6 +11,7 @@ from torch import Tensor
 
 import planning
 import robots
+from examples.disturbances import DisturbedRobot
 from planning.protocols import DistanceField
 from planning.workspace import Workspace
 from robots.inverse_kinematics import solve
@@ -118,7 +119,9 @@ def plan_reach(
     return planning.Planner(model, config, seed).plan(q, goal, field)
 
 
-def execute(robot: SimulatedMobileRobot, model: robots.Robot, waypoints: Tensor, speed: float = 1.0) -> None:
+def execute(
+    robot: SimulatedMobileRobot | DisturbedRobot, model: robots.Robot, waypoints: Tensor, speed: float = 1.0
+) -> None:
     """Move the arm along postures (n, dof) of `model`, the base at rest."""
     limits = speed * SPEED_SHARE * model.velocity_limits
     path = planning.Trajectory.through(waypoints)

@@ -37,27 +37,27 @@ class DisturbedRobot:
     """
 
     def __init__(self, robot: SimulatedMobileRobot, disturbances: Sequence[Disturbance]) -> None:
-        self.robot, self.disturbances = robot, disturbances
+        self._undisturbed, self.disturbances = robot, disturbances
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.robot, name)
+        return getattr(self._undisturbed, name)
 
     @property
     def time(self) -> float:
         """Simulated time [s]."""
-        return self.robot.time
+        return self._undisturbed.time
 
     def base_state(self) -> Float[ndarray, "3"]:
         """x, y [m] and yaw [rad] of the base."""
-        return self.robot.base_state()
+        return self._undisturbed.base_state()
 
     def look_at(self, point: Float[ndarray, "3"]) -> None:
         """Turn the head towards a point [m]."""
-        self.robot.look_at(point)
+        self._undisturbed.look_at(point)
 
     def observe(self) -> DepthFrame | None:
         """The newest image, disturbed; None if the sensor gives none."""
-        frame: DepthFrame | None = self.robot.observe()
+        frame: DepthFrame | None = self._undisturbed.observe()
         for disturbance in self.disturbances:
             frame = disturbance.frame(frame)
         return frame
@@ -65,8 +65,8 @@ class DisturbedRobot:
     def drive(self, v: float, omega: float, duration: float) -> None:
         """Drive for some time [s] while the world changes."""
         for disturbance in self.disturbances:
-            disturbance.advance(self.robot, duration)
-        self.robot.drive(v, omega, duration)
+            disturbance.advance(self._undisturbed, duration)
+        self._undisturbed.drive(v, omega, duration)
 
 
 @dataclass

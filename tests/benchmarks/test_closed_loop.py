@@ -152,9 +152,11 @@ def test_furniture_is_moved_once_when_it_is_time() -> None:
 
 def test_a_disturbed_robot_is_a_mobile_robot() -> None:
     with World(hall()) as world:
-        robot = DisturbedRobot(drive_in(world, -1.2), [SensorFault("silent", 0.0, 9.0)])
+        quiet = drive_in(world, -1.2)
+        robot = DisturbedRobot(quiet, [SensorFault("silent", 0.0, 9.0)])
         assert isinstance(robot, MobileRobot)
-        assert robot.observe() is None and robot.robot.observe() is not None
+        assert robot.observe() is None and quiet.observe() is not None
+        assert robot.robot is quiet.robot, "what it has not itself is the undisturbed robot's"
         robot.drive(0.0, 0.1, 0.1)
         assert len(robot.recording) == 1 and robot.time == pytest.approx(0.1, abs=0.01)
 
