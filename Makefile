@@ -2,7 +2,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo test test-slow lint types benchmark clean
+.PHONY: help setup demo test test-slow lint types docs benchmark clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*##/\t/'
@@ -29,6 +29,9 @@ lint: setup      ## style and formatting
 
 types: setup     ## static types
 	$(VENV)/bin/mypy
+
+docs: setup      ## the documentation, warnings as errors: build/site/index.html
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --quiet --strict
 
 benchmark: setup  ## cost of a training step and of a planner iteration, as ratios
 	$(RUN) -m benchmarks.step_cost

@@ -122,7 +122,7 @@ class GridField(AnalyticField):
 
     Args:
         values: (nx, ny, nz) signed distances [m].
-        origin: (3,) world position of values[0, 0, 0] [m].
+        origin: (3,) world position [m] of the first value.
         spacing: distance of grid points [m].
     """
 

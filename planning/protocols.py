@@ -128,7 +128,7 @@ class CompilableRobot(LinkedRobot, Protocol):
         """The moving joints, parents first: arrays parent, origin, axis, prismatic, column, multiplier and offset.
 
         Joint j carries frame j + 1, frame 0 is the root; frame j + 1 is `origin[j]` in its parent followed by a turn
-        about (or slide along) `axis[j]` by multiplier[j] * q[column[j]] + offset[j] [rad | m].
+        [rad] about (or slide [m] along) `axis[j]` by `multiplier[j] * q[column[j]] + offset[j]`.
         """
         ...
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from robots.errors import SceneError
 from robots.kinematic_tree import KinematicTree
 from robots.link_geometry import collision_pieces
+from robots.simulation.ray_casting import joined
 from robots.simulation.triangle_tree import build, signed_distances
 
 
@@ -38,13 +39,15 @@ class MeshField:
     def __init__(self, meshes: trimesh.Trimesh | Iterable[trimesh.Trimesh]) -> None:
         given = [meshes] if isinstance(meshes, trimesh.Trimesh) else list(meshes)
         if not all(np.isfinite(mesh.vertices).all() for mesh in given):
-            raise SceneError("a distance field needs finite vertices, and a mesh has NaN or inf among its own")
+            raise SceneError(
+                "a distance field needs finite vertices, and a mesh has NaN or inf among its own"
+            )
         parts = [part for mesh in given for part in _parts(mesh)]
         if not parts:
             raise SceneError("a distance field needs at least one triangle of positive area; there is none")
         solids = [part for part in parts if part.is_watertight]
         sheets = [part for part in parts if not part.is_watertight]
-        bodies = [*solids, *([trimesh.util.concatenate(sheets)] if sheets else [])]
+        bodies = [*solids, *([joined(sheets)] if sheets else [])]
         closed = [bool(body.is_watertight and body.volume > 0) for body in bodies]
         self._tree = build(bodies, closed)
         corners = self._tree.corners

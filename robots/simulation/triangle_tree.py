@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple, no_type_check
 
@@ -26,7 +27,7 @@ class TriangleTree(NamedTuple):
         lower: corner of each node's box [m].
         upper: the opposite one [m].
         first: a leaf's first triangle.
-        count: triangles of a leaf, 0 for an inner node, whose left child follows it.
+        held: triangles of a leaf, 0 for an inner node, whose left child follows it.
         right: the other child of an inner node.
         root: node of each body.
         closed: bodies that enclose a volume: everything outside of their box is outside of them.
@@ -37,7 +38,7 @@ class TriangleTree(NamedTuple):
     lower: Float[np.ndarray, "n 3"]
     upper: Float[np.ndarray, "n 3"]
     first: Int[np.ndarray, " n"]
-    count: Int[np.ndarray, " n"]
+    held: Int[np.ndarray, " n"]
     right: Int[np.ndarray, " n"]
     root: Int[np.ndarray, " b"]
     closed: Bool[np.ndarray, " b"]
@@ -48,27 +49,27 @@ def build(bodies: Sequence[trimesh.Trimesh], closed: Sequence[bool]) -> Triangle
     corners = np.concatenate([np.asarray(body.triangles, dtype=np.float64) for body in bodies])
     normals = np.concatenate([feature_normals(body) for body in bodies])
     centres, order = corners.mean(axis=1), np.arange(len(corners))
-    nodes: list[list[int]] = []  # first, count, right
+    nodes: list[list[int]] = []  # first, held, right
     boxes: list[np.ndarray] = []
 
     def split(begin: int, end: int) -> int:
-        node, held = len(nodes), corners[order[begin:end]].reshape(-1, 3)
+        node, inside = len(nodes), corners[order[begin:end]].reshape(-1, 3)
         nodes.append([begin, end - begin, -1])
-        boxes.append(np.stack([held.min(axis=0), held.max(axis=0)]))
+        boxes.append(np.stack([inside.min(axis=0), inside.max(axis=0)]))
         if end - begin > LEAF:
-            inside = centres[order[begin:end]]
-            middle, axis = (end - begin) // 2, int(np.ptp(inside, axis=0).argmax())
-            order[begin:end] = order[begin:end][np.argpartition(inside[:, axis], middle)]
+            middles = centres[order[begin:end]]
+            middle, axis = (end - begin) // 2, int(np.ptp(middles, axis=0).argmax())
+            order[begin:end] = order[begin:end][np.argpartition(middles[:, axis], middle)]
             split(begin, begin + middle)
             nodes[node][1:] = [0, split(begin + middle, end)]
         return node
 
     ends = np.cumsum([0, *(len(body.faces) for body in bodies)])
-    roots = [split(int(begin), int(end)) for begin, end in zip(ends[:-1], ends[1:], strict=True)]
-    first, count, right = np.array(nodes, dtype=np.int64).T.copy()
+    roots = [split(int(begin), int(end)) for begin, end in itertools.pairwise(ends)]
+    first, held, right = np.array(nodes, dtype=np.int64).T.copy()
     lower, upper = np.stack(boxes, axis=1)
     return TriangleTree(
-        corners[order], normals[order], lower, upper, first, count, right, np.array(roots), np.array(closed)
+        corners[order], normals[order], lower, upper, first, held, right, np.array(roots), np.array(closed)
     )
 
 
@@ -138,14 +139,14 @@ def _search(tree, root, p, bound):
         node = stack[waiting]
         if _box_square(tree, node, p) >= bound:
             continue
-        if tree.count[node] == 0:
+        if tree.held[node] == 0:
             left, right = node + 1, tree.right[node]
             if _box_square(tree, left, p) < _box_square(tree, right, p):
                 left, right = right, left
             stack[waiting], stack[waiting + 1] = left, right  # the nearer one is taken up first
             waiting += 2
             continue
-        for t in range(tree.first[node], tree.first[node] + tree.count[node]):
+        for t in range(tree.first[node], tree.first[node] + tree.held[node]):
             cx, cy, cz, at = _closest(tree.corners[t], p)
             square = (p[0] - cx) ** 2 + (p[1] - cy) ** 2 + (p[2] - cz) ** 2
             if square < bound:

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from isdf import DatasetError, FrameError
+from isdf import DatasetError, FrameError, PinholeCamera
 from isdf.datasets import DepthSequence, RosbagSequence, open_sequence
 from tests.isdf.test_readers import CAMERA, assert_reads, make_depths, steady_motion
 
@@ -79,8 +79,8 @@ class BagWriter:
         )
         self.write(topic, t, message)
 
-    def info(self, topic: str = INFO) -> None:
-        c = CAMERA
+    def info(self, topic: str = INFO, camera: PinholeCamera = CAMERA) -> None:
+        c = camera
         K = np.array([c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1.0])
         P = np.array([c.fx + 1, 0, c.cx, 0, 0, c.fy, c.cy, 0, 0, 0, 1.0, 0])
         matrices = {"D": np.zeros(5), "K": K, "R": np.eye(3).ravel(), "P": P}

@@ -84,10 +84,14 @@ def test_a_sheet_with_a_rim_is_outside_where_it_faces():
 def test_files_and_urdfs_give_the_field_of_their_meshes(tmp_path):
     up = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
     BOX.export(tmp_path / "box.ply")
-    trimesh.Scene([BOX.copy().apply_scale(1000).apply_transform(np.linalg.inv(up))]).export(tmp_path / "box.glb")
+    trimesh.Scene([BOX.copy().apply_scale(1000).apply_transform(np.linalg.inv(up))]).export(
+        tmp_path / "box.glb"
+    )
     points = _around(MeshField(BOX).bounds, 500)
     wanted = MeshField(BOX).distance(points)
-    torch.testing.assert_close(MeshField.read(tmp_path / "box.ply").distance(points), wanted, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        MeshField.read(tmp_path / "box.ply").distance(points), wanted, rtol=0, atol=1e-6
+    )
     turned = MeshField.read(tmp_path / "box.glb", T_world_mesh=up, scale=0.001)
     torch.testing.assert_close(turned.distance(points), wanted, rtol=0, atol=1e-6)
 
