@@ -203,7 +203,7 @@ Command = (
 # tyro joins lines that are not indented.
 DESCRIPTION = """Signed distance fields from posed depth images.
   isdf map RECORDING --out FOLDER                      a map of a recording
-  isdf map --resume FOLDER                             go on after Ctrl-C or kill
+  isdf map --resume FOLDER                             go on after a stop
   isdf query FOLDER --points P.npy --out ANSWERS.npz   distances and gradients
   isdf export FOLDER --format ply --out MESH.ply       for other programs
   isdf info FOLDER                                     what a map file says

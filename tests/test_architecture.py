@@ -132,6 +132,13 @@ def test_importing_a_package_loads_nothing_optional(package: str, unwanted: set[
     assert not (found := loaded & unwanted), f"import {package} loads {sorted(found)}"
 
 
+def test_mapping_and_planning_need_no_optional_package() -> None:
+    """`nox -s core` does the same in an environment that has none of them."""
+    command = [sys.executable, "-m", "tests.core_install", "--blocked"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
 MEASURE = """
 import time, torch
 start = time.process_time()
