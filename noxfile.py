@@ -21,7 +21,8 @@ def tests(session: nox.Session) -> None:
 
 @nox.session(python=PYTHONS)
 def core(session: nox.Session) -> None:
-    """Install what maps and plans alone, and import it: no simulator, no solver."""
+    """Install what maps and plans alone, and do both: no simulator, no solver."""
     pins = ("--constraint", "constraints.txt") if session.python == PINNED else ()
     session.install(*pins, ".")
-    session.run("python", "-c", "import isdf, planning, isdf.export, isdf.cli")
+    session.run("python", "-m", "tests.core_install")
+    session.run("isdf", "--help", silent=True)

@@ -1,1 +1,1 @@
-"""Closed-loop examples: the only place where maps, planner and robots meet."""
+"""Examples e01 to e09, each on a page, and longer ones: the only place where maps, planner and robots meet."""

@@ -3,6 +3,7 @@
 from .background import BackgroundMapper, Rates, Snapshot
 from .camera import PinholeCamera
 from .cost import CostField
+from .display import plot_slice
 from .errors import (
     BackgroundError,
     CameraError,
@@ -13,6 +14,7 @@ from .errors import (
     FrameError,
     IsdfError,
     NotReadyError,
+    SourceError,
 )
 from .field import GridField, NeuralField, bake, query
 from .frames import DepthFrame
@@ -51,7 +53,9 @@ __all__ = [
     "Rates",
     "SamplingConfig",
     "Snapshot",
+    "SourceError",
     "bake",
     "load_map",
+    "plot_slice",
     "query",
 ]

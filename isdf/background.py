@@ -218,6 +218,14 @@ class BackgroundMapper:
         if self._error is not None:
             self._check()
 
+    def __repr__(self) -> str:
+        rates = self.rates()
+        state = "failed" if self._error is not None else "closed" if self._closing else "running"
+        return (
+            f"<BackgroundMapper of {type(self._mapper).__name__}, {state}: {rates.used} frames used, {rates.dropped} "
+            f"dropped, {rates.refused} refused, {rates.snapshots} snapshots>"
+        )
+
     def __enter__(self) -> BackgroundMapper:
         return self
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import difflib
+import io
 import json
 import logging
 import os
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,12 +44,7 @@ VOXEL_METHODS: dict[str, type[VoxelConfig]] = {
 
 @dataclass(frozen=True)
 class Map:
-    """Map a recorded sequence: leaves the map, mesh.ply, slice pictures and report.json in a folder.
-
-    Give one of three clocks. --steps-per-frame K trains K steps on every frame. --cpu-per-second C is live: at most
-    C CPU seconds (all threads) for each second of sequence; frames that arrive while it is busy are dropped.
-    --steps-per-second K is live on a machine that makes K steps a second, whatever this one makes.
-    """
+    """Map a recorded sequence; leave map, mesh, slices and report in a folder."""
 
     sequence_dir: tyro.conf.Positional[Path | None] = None
     """Recorded folder, ReplicaCAD, Replica, ScanNet, 7-Scenes or TUM RGB-D sequence, or a ROS bag."""
@@ -58,15 +57,17 @@ class Map:
     """Seconds of wall time between two checkpoints of the map; killed at any moment, a run has lost no more than
     that. Saving does not count against the clock."""
     steps_per_frame: int | None = None
-    """Optimisation steps on every frame."""
+    """Clock 1 of 3: every frame is mapped, and trained on for so many optimisation steps."""
     steps_per_second: float | None = None
-    """Optimisation steps for each second of sequence; the paper's machine made about 30."""
+    """Clock 2 of 3, live as on a machine that makes so many optimisation steps a second, whatever this one makes
+    (the paper's made about 30); frames that arrive while it is busy are dropped."""
     cpu_per_second: float | None = None
-    """CPU seconds allowed for each second of sequence; 1.0 when neither clock is given."""
+    """Clock 3 of 3, live on this machine: at most so many CPU seconds (of all threads) for each second of
+    sequence, and frames that arrive while it is busy are dropped. 1.0 when no clock is given."""
     method: Literal["default", "isdf", "exact", "voxblox", "fiesta", "kinectfusion"] = "default"
-    """default: exact where the camera looked, guessed by a network elsewhere. isdf: the paper's neural field. exact:
-    distances to sub-voxel surface points of a TSDF. voxblox, fiesta, kinectfusion: the rivals that the paper names.
-    All but isdf need no steps and no more time than fusion takes."""
+    """default: exact where the camera looked, guessed by a network elsewhere. isdf: the paper's neural field.
+    exact: distances to sub-voxel surface points of a TSDF. voxblox, fiesta, kinectfusion: the rivals that the paper
+    names. All but isdf make no steps and take no more time than fusion."""
     voxel: float | None = None
     """Edge of a voxel of the voxel methods [m]; by default 0.04 (exact), 0.055 (voxblox, fiesta) and 0.07
     (kinectfusion)."""
@@ -190,6 +191,8 @@ def _restored(options: dict[str, Any], out: Path) -> Map:
         ) from None
 
 
+COMMANDS: dict[str, type] = {"map": Map, "query": Query, "export": Export, "info": Info}
+
 Command = (
     Annotated[Map, tyro.conf.subcommand("map")]
     | Annotated[Query, tyro.conf.subcommand("query")]
@@ -197,20 +200,29 @@ Command = (
     | Annotated[Info, tyro.conf.subcommand("info")]
 )
 
-DESCRIPTION = """Signed distance fields from posed depth images: map a recording; query, export or describe the map.
-
-Exit codes: 0 done; 1 a file could not be read or written, or a bug; 2 bad input or unknown options; 130 stopped by
-Ctrl-C and 143 by SIGTERM (isdf map leaves a checkpoint then: isdf map --resume FOLDER). With --json the outcome is one
-line of JSON on standard output, and so is an error on standard error."""
+# tyro joins lines that are not indented.
+DESCRIPTION = """Signed distance fields from posed depth images.
+  isdf map RECORDING --out FOLDER                      a map of a recording
+  isdf map --resume FOLDER                             go on after a stop
+  isdf query FOLDER --points P.npy --out ANSWERS.npz   distances and gradients
+  isdf export FOLDER --format ply --out MESH.ply       for other programs
+  isdf info FOLDER                                     what a map file says
+  isdf COMMAND --help                                  the options of a command
+  --json: outcome or error as one line of JSON on stdout or stderr
+  exit codes:
+    0     done
+    1     a file could not be read or written, or a bug
+    2     bad input, an unknown command or an unknown option
+    130   stopped by Ctrl-C, 143 by SIGTERM; isdf map leaves a checkpoint then"""
 
 
 def main() -> None:
     """Entry point of the `isdf` command; what goes wrong is said in one line, see `DESCRIPTION` for exit codes."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    as_json = "--json" in sys.argv
+    words = sys.argv[1:]
+    as_json = "--json" in words
     try:
-        command = tyro.cli(Command, prog="isdf", description=DESCRIPTION)  # type: ignore[arg-type]
-        outcome = command.run()
+        outcome = _parsed(words, as_json).run()
         print(json.dumps(outcome.data) if as_json else outcome.text, flush=True)
     except IsdfError as error:
         _fail(2, type(error).__name__, str(error), as_json)
@@ -222,6 +234,27 @@ def main() -> None:
         _fail(128 + stopped.number, "Stopped", str(stopped), as_json)
     except KeyboardInterrupt:
         _fail(130, "Stopped", "stopped by SIGINT", as_json)
+
+
+def _parsed(words: list[str], as_json: bool) -> Map | Query | Export | Info:
+    """The command that the words ask for.
+
+    Raises:
+        ConfigError: there is no such command; or, for machines, what tyro has to say about an option.
+        SystemExit: --help, or tyro has told a person which option is wrong.
+    """
+    if words and not words[0].startswith("-") and words[0] not in COMMANDS:
+        close = difflib.get_close_matches(words[0], COMMANDS, n=1, cutoff=0.4)
+        guess = f"did you mean {close[0]}? " if close else ""
+        raise ConfigError(f"there is no command {words[0]!r}; {guess}The commands are {', '.join(COMMANDS)}")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said) if as_json else contextlib.nullcontext():
+            return tyro.cli(Command, prog="isdf", description=DESCRIPTION)  # type: ignore[arg-type]
+    except SystemExit as end:
+        if as_json and end.code:
+            raise ConfigError(" ".join(re.sub("[╭╮╰╯─│]", " ", said.getvalue()).split())) from None
+        raise
 
 
 def _fail(code: int, kind: str, message: str, as_json: bool) -> NoReturn:

@@ -44,7 +44,7 @@ def map_file(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class Query:
-    """Distances and gradients of a saved map at any world points."""
+    """Ask a saved map for distances and gradients at any world points."""
 
     map: tyro.conf.Positional[Path]
     """Folder that `isdf map` wrote, or a map file."""
@@ -77,17 +77,14 @@ class Query:
 
 @dataclass(frozen=True)
 class Export:
-    """A saved map for other programs.
-
-    ply, glb: the surface as a mesh. pointcloud: the surface as points with normals (PLY). npz, mha, mhd: distances on
-    a grid, for numpy or as MetaImage (ITK, VTK, ParaView). ros-map: the floor plan that the ROS map_server reads
-    (YAML and PGM): occupied, free where every height of --band was seen, unknown elsewhere.
-    """
+    """Write a saved map for other programs: mesh, points, grid or floor plan."""
 
     map: tyro.conf.Positional[Path]
     """Folder that `isdf map` wrote, or a map file."""
     format: Format
-    """See above."""
+    """ply, glb: the surface as a mesh. pointcloud: the surface as points with normals (PLY). npz, mha, mhd: distances
+    on a grid, for numpy or as MetaImage (ITK, VTK, ParaView). ros-map: the floor plan that the ROS map_server reads
+    (YAML and PGM): occupied, free where every height of --band was seen, unknown elsewhere."""
     out: Path
     """The file to write."""
     config: tyro.conf.OmitArgPrefixes[ExportConfig] = ExportConfig()  # noqa: RUF009
@@ -113,7 +110,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Info:
-    """What a map file says about itself: method, units, bounds, where it comes from, what is in it."""
+    """Tell what a map file says about itself: method, bounds, provenance."""
 
     map: tyro.conf.Positional[Path]
     """Folder that `isdf map` wrote, or a map file."""

@@ -41,3 +41,7 @@ class BackgroundError(IsdfError):
 
 class EvaluationError(IsdfError):
     """A map cannot be judged: its answers are not numbers, or there is nothing to judge it by."""
+
+
+class SourceError(IsdfError):
+    """A live camera cannot be opened, or its images have stopped coming."""

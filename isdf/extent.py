@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -27,3 +28,11 @@ def grown(bounds: Float[Tensor, "2 3"], frame: DepthFrame, max_depth: float) -> 
         corners = torch.cat([corners, torch.quantile(points, torch.tensor([OUTLIERS, 1 - OUTLIERS]), dim=0)])
     low, high = torch.minimum(bounds[0], corners.amin(dim=0)), torch.maximum(bounds[1], corners.amax(dim=0))
     return torch.stack([low, high])
+
+
+def fits(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], most: int) -> bool:
+    """Whether a box between lattice indices, as floats, has at most so many entries and its indices are integers.
+
+    Numbers too large for an integer become small ones when they are converted, so this is asked before.
+    """
+    return bool(np.prod(high - low) <= most and np.abs([low, high]).max() < 2.0**40)

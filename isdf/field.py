@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .display import ShownField
 from .errors import ConfigError, IsdfError
 from .network import SDFNetwork
 
@@ -42,7 +43,7 @@ def check_points(points: Tensor) -> None:
         )
 
 
-class AnalyticField:
+class AnalyticField(ShownField):
     """Base of the fields that know their own gradient: what follows from `distance_and_gradient`.
 
     Attributes:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from .bounds import BoundMethod, supervise
 from .cost import CostField
+from .display import ShownMapper
 from .errors import ConfigError, DivergedError, FrameError, NotReadyError
 from .extent import grown, nothing_seen
 from .field import NeuralField
@@ -113,7 +114,7 @@ class IsdfConfig:
         )
 
 
-class IsdfMapper:
+class IsdfMapper(ShownMapper):
     """Learns a signed distance field online.
 
     Call `integrate` with every new frame and, when there is time to spare, `step` or `run_for`; `field` gives an

@@ -91,10 +91,7 @@ def read(path: Path, expected: str, version: int) -> tuple[dict[str, torch.Tenso
             f"{path}: a map of format {found['format']!r}, not {expected!r}; isdf.load_map(path) reads every kind"
         )
     if found.get("version") != version:
-        raise CheckpointError(
-            f"{path}: map format version {found.get('version')!r}, this release reads {version}; "
-            "update the package or map again"
-        )
+        raise CheckpointError(_other_version(path, "map format version", found.get("version"), version))
     stated = _read_front(path)["__metadata__"]
     try:
         tensors = from_bytes(path.read_bytes())
@@ -183,13 +180,18 @@ def _checked_header(path: Path, front: dict[str, Any]) -> dict[str, Any]:
         raise CheckpointError(f"{path}: a safetensors file, but not a map written by this package")
     version = found.get("file_version")
     if type(version) is not int or not 1 <= version <= FILE_VERSION:
-        age = "newer" if type(version) is int and version > FILE_VERSION else "other"
-        raise CheckpointError(
-            f"{path}: map file version {version!r} is {age} than the {FILE_VERSION} that this release reads; "
-            "update the package or map again"
-        )
+        raise CheckpointError(_other_version(path, "map file version", version, FILE_VERSION))
     described = {name: entry for name, entry in front.items() if name != "__metadata__"}
     return found | {"tensors": {n: {"dtype": e["dtype"], "shape": e["shape"]} for n, e in described.items()}}
+
+
+def _other_version(path: Path, what: str, found: Any, known: int) -> str:
+    """What to do about a file of another version."""
+    if type(found) is not int:
+        return f"{path}: {what} {found!r} is no version number; map again or restore a copy"
+    if found > known:
+        return f"{path}: {what} {found} is newer than the {known} that this release reads; update the package"
+    return f"{path}: {what} {found} is older than the {known} that this release reads; map again"
 
 
 def _checksum(text: str, tensors: dict[str, torch.Tensor]) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg", force=False)
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -15,10 +13,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from .errors import ConfigError
 from .slice_geometry import corners, slice_basis
 
 # Of the same order as the distance at which planners stop caring; farther away all blues look the same.
 COLOUR_LIMIT = 1.5
+# Picture elements along the longer side of a slice in a notebook.
+ELEMENTS = 250
+
+
+class SliceFigure(Figure):
+    """A figure that notebooks show inline, whether or not pyplot was imported."""
+
+    def _repr_png_(self) -> bytes:
+        data = io.BytesIO()
+        self.savefig(data, format="png", dpi=110)
+        return data.getvalue()
 
 
 def estimate_up(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3"]:
@@ -108,6 +118,31 @@ def save_slices(
         ax.set_xlabel("[m]")
     figure.colorbar(image, ax=list(axes), label="signed distance [m]", shrink=0.8)
     figure.savefig(path, dpi=110)
+
+
+def slice_figure(
+    field: Any,
+    height: float | None,
+    up: Float[np.ndarray, "3"],
+    poses: Float[np.ndarray, "n 4 4"] | None,
+    spacing: float | None,
+    bounds: Float[Tensor, "2 3"] | None,
+    grey_unknown: bool,
+) -> SliceFigure:
+    """What `isdf.plot_slice` returns; its arguments, in its order."""
+    if not 0 < np.linalg.norm(up) < np.inf:
+        raise ConfigError(f"up must be a direction, got {tuple(up)}")
+    up = up / np.linalg.norm(up)
+    box = corners((field.bounds if bounds is None else bounds).cpu().numpy()) @ slice_basis(up).T
+    across = np.ptp(box, axis=0)
+    middle = float(box[:, 2].mean()) if height is None else height
+    spacing = spacing or float(across[:2].max()) / ELEMENTS
+    figure = SliceFigure(figsize=(6.5, 5.2 * across[1] / across[0] + 0.9), layout="constrained")
+    axes = figure.subplots()
+    image = draw_slice(axes, field, middle, up, poses, None, spacing, bounds, grey_unknown)
+    axes.set_xlabel("[m]")
+    figure.colorbar(image, ax=axes, label="signed distance [m]", shrink=0.8)
+    return figure
 
 
 def slice_heights(field: Any, up: Float[np.ndarray, "3"], count: int = 3) -> list[float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import html
 from dataclasses import dataclass
 
 from planning.trajectory import Trajectory
@@ -22,7 +23,7 @@ class Status(enum.Enum):
     NO_PATH = "no path"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PlanResult:
     """Outcome of planning. Failing is a status, not an exception.
 
@@ -44,6 +45,27 @@ class PlanResult:
     cost_history: tuple[float, ...]
     iterations: int
     seconds: float
+
+    def __repr__(self) -> str:
+        facts = "".join(f", {name} {value}" for name, value in self._facts())
+        return f"<PlanResult: {self.status.value}{facts}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: a table, in red where the trajectory must not be driven."""
+        colour = "green" if self.success else "red"
+        rows = "".join(
+            f"<tr><td>{name}</td><td>{html.escape(value)}</td></tr>"
+            for name, value in [*self._facts(), ("message", self.message)]
+        )
+        return f'<b style="color:{colour}">{html.escape(self.status.value)}</b><table>{rows}</table>'
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            ("clearance", f"{100 * self.clearance:.1f} cm"),
+            ("waypoints", f"{len(self.trajectory)} in {self.trajectory.duration:.2f} s"),
+            ("iterations", str(self.iterations)),
+            ("planned in", f"{self.seconds:.3f} s"),
+        ]
 
     @property
     def success(self) -> bool:

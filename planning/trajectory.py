@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -10,8 +12,11 @@ from torch import Tensor
 
 from planning.errors import TrajectoryError
 
+if TYPE_CHECKING:
+    from planning.joint_figure import JointFigure
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """Waypoints in joint space with their times, joined by straight lines.
 
@@ -92,6 +97,22 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.waypoints)
 
+    def __repr__(self) -> str:
+        start, goal = (_posture(self.waypoints[i]) for i in (0, -1))
+        return (
+            f"<Trajectory: {len(self)} waypoints of {self.num_dofs} joints in {self.duration:.2f} s, "
+            f"from {start} to {goal}>"
+        )
+
+    def plot(self, names: Sequence[str] = ()) -> JointFigure:
+        """A figure of all joints over time; notebooks show it inline. `names` label the curves."""
+        from planning.joint_figure import joint_figure
+
+        return joint_figure(self, names)
+
+    def _repr_png_(self) -> bytes:
+        return self.plot()._repr_png_()
+
     @property
     def num_dofs(self) -> int:
         """Number of joints."""
@@ -123,6 +144,10 @@ class Trajectory:
         times = self.times[0] + fractions * (self.times[-1] - self.times[0])
         times[-1] = self.times[-1]
         return Trajectory(self.at(times), times)
+
+
+def _posture(q: Float[Tensor, " dof"]) -> str:
+    return "(" + " ".join(f"{value:.2f}" for value in q.tolist()) + ")"
 
 
 def _interpolate(

@@ -21,10 +21,11 @@ from robots.errors import (
     UnknownRobotError,
     UrdfError,
 )
+from robots.gripper import Gripper
 from robots.inverse_kinematics import IkConfig, IkSolution
 from robots.kinematic_tree import KinematicTree
 from robots.link_pairs import PairConfig
-from robots.model import Gripper, Robot
+from robots.model import Robot
 from robots.registry import available, load
 from robots.robot_fitting import RobotFitConfig, fit_robot
 from robots.self_filter import remove_robot

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 
@@ -52,19 +52,25 @@ class SphereCheck:
         return self.max_uncovered <= MAX_UNCOVERED and self.worst_miss <= MAX_UNCOVERED
 
 
-def check_spheres(robot: Robot, configurations: int = 200, seed: int = 0) -> SphereCheck:
+def check_spheres(
+    robot: Robot,
+    configurations: int = 200,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda *_: None,
+) -> SphereCheck:
     """Compare a robot's spheres with the convex hulls of its collision geometry.
 
     Args:
         robot: the robot with the spheres to check.
         configurations: number of random configurations within the limits.
         seed: of the configurations and samples.
+        progress: told how many configurations of all are done.
 
     Raises `RobotError` where pybullet is missing.
     """
     q = random_configurations(robot, configurations, seed)
     sphere_gaps = _sphere_gaps(robot, q)
-    hull_gaps = _hull_gaps(robot, q)
+    hull_gaps = _hull_gaps(robot, q, progress)
     touching, colliding = sphere_gaps <= 0, hull_gaps <= 0
     missed = colliding & ~touching
     pieces = collision_pieces(robot.urdf_path)
@@ -136,7 +142,9 @@ def _sphere_gaps(robot: Robot, q: Tensor) -> np.ndarray:
     return torch.cat(gaps).double().numpy()
 
 
-def _hull_gaps(robot: Robot, q: Tensor, reach: float = 0.05) -> np.ndarray:
+def _hull_gaps(
+    robot: Robot, q: Tensor, progress: Callable[[int, int], None], reach: float = 0.05
+) -> np.ndarray:
     """Least distance (n,) [m] between tested links' hulls as pybullet sees it; inf past `reach`."""
     if find_spec("pybullet") is None:
         raise RobotError(
@@ -166,6 +174,7 @@ def _hull_gaps(robot: Robot, q: Tensor, reach: float = 0.05) -> np.ndarray:
             for a, b in pairs:
                 found = pybullet.getClosestPoints(body, body, reach, a, b, physicsClientId=client)
                 gaps[i] = min([gaps[i], *(contact[8] + ENGINE_MARGIN for contact in found)])
+            progress(i + 1, len(q))
         return gaps
     finally:
         pybullet.disconnect(client)

@@ -6,7 +6,6 @@ import itertools
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from robots.errors import RobotError, SphereFileError, UnknownJointError
 from robots.fine_cover import fine_cover
+from robots.gripper import Gripper
 from robots.joint_chain import JointChain, joint_chain
 from robots.kinematic_tree import KinematicTree
 from robots.moving_frames import MovingFrames
@@ -26,21 +26,6 @@ logger = logging.getLogger(__name__)
 
 # A planner cannot time a joint without a velocity limit; these are slow for any arm or lift on the market.
 DEFAULT_VELOCITY = {"revolute": 1.0, "continuous": 1.0, "prismatic": 0.1}  # [rad/s], [rad/s], [m/s]
-
-
-@dataclass(frozen=True)
-class Gripper:
-    """A gripper driven by some joints: their values open and closed [rad | m], and the grip force [N]."""
-
-    joint_names: tuple[str, ...]
-    open_position: tuple[float, ...]
-    closed_position: tuple[float, ...]
-    max_force: float
-
-    def __post_init__(self) -> None:
-        sizes = {len(self.joint_names), len(self.open_position), len(self.closed_position)}
-        if len(sizes) != 1:
-            raise RobotError(f"a gripper needs one open and one closed position a joint: {self}")
 
 
 class Robot:
@@ -139,6 +124,16 @@ class Robot:
             head_joints=head_joints,
             camera_link=camera_link,
         )
+
+    def __repr__(self) -> str:
+        joints = ", ".join(self.joint_names)
+        return f"<Robot {self.name}: {self.num_dofs} joints ({joints}), {len(self.sphere_links)} spheres>"
+
+    def _repr_png_(self) -> bytes:
+        """For notebooks: hulls and spheres at rest."""
+        from robots.sphere_figure import sphere_figure
+
+        return sphere_figure(self)._repr_png_()
 
     @property
     def name(self) -> str:

@@ -11,8 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from robots.errors import UnknownRobotError
+from robots.gripper import Gripper
 from robots.mesh_paths import example_robot_data, installed_file
-from robots.model import Gripper, Robot
+from robots.model import Robot
 from robots.spheres import load_spheres
 from robots.urdf import Attachment, PlanarBase, compose, extract_subtree
 

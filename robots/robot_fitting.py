@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -43,6 +43,7 @@ def fit_robot(
     floor_links: Collection[str] = (),
     ignored_pairs: Collection[tuple[str, str]] = (),
     config: RobotFitConfig | None = None,
+    progress: Callable[[int, int], None] = lambda *_: None,
 ) -> tuple[SphereSet, dict[str, SphereFit]]:
     """Cover every link with collision geometry by spheres, at most `budget` in all.
 
@@ -57,6 +58,7 @@ def fit_robot(
         floor_links: links that drive on the floor.
         ignored_pairs: link pairs known to need no self-collision test, beside those found.
         config: how the budget is shared out.
+        progress: told how many spheres of the budget are placed.
 
     Returns the sphere set, with the link pairs that need no test already marked, and the quality of the
     fit of each body, by the name of its first link. Raises `RobotError` where the budget is too small,
@@ -76,7 +78,7 @@ def fit_robot(
     ]
     if not bodies:
         raise RobotError(f"{urdf}: no link has collision geometry to cover (after skipping {sorted(skip)})")
-    _share_out(bodies, budget)
+    _share_out(bodies, budget, progress)
     rows: dict[str, np.ndarray] = {}
     report = {}
     for body in bodies:
@@ -131,14 +133,15 @@ class _Body:
         return shared
 
 
-def _share_out(bodies: Sequence[_Body], budget: int) -> None:
+def _share_out(bodies: Sequence[_Body], budget: int, progress: Callable[[int, int], None]) -> None:
     """Give each further ball to the body that is covered worst for its size."""
     if budget < len(bodies):
         raise RobotError(
             f"{budget} spheres do not cover {len(bodies)} bodies that move against each other; give more"
         )
-    for _ in range(budget - len(bodies)):
+    for placed in range(len(bodies), budget):
         growing = [body for body in bodies if not body.cover.stalled]
         if not growing:
             return
         max(growing, key=lambda body: body.excess).cover.add()
+        progress(placed + 1, budget)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,21 @@ VIEWS = ((15, -60), (15, 30))  # elevation and azimuth [deg]
 HULL_COLOUR, SPHERE_COLOUR = "0.35", "tab:orange"
 
 
+class RobotFigure(Figure):
+    """A figure that notebooks show inline, whether or not pyplot was imported."""
+
+    def _repr_png_(self) -> bytes:
+        data = io.BytesIO()
+        self.savefig(data, format="png", dpi=70)
+        return data.getvalue()
+
+
 def save_sphere_figure(path: str | Path, robot: Robot, q: Tensor | None = None) -> None:
+    """Write the picture of `sphere_figure`."""
+    sphere_figure(robot, q).savefig(path, dpi=110)
+
+
+def sphere_figure(robot: Robot, q: Tensor | None = None) -> RobotFigure:
     """Draw hulls (grey), then hulls with spheres (orange), from two sides, at q (dof,) or at rest."""
     q = robot.rest if q is None else q
     poses = robot.tree.link_transforms(robot.joint_values(q))
@@ -30,7 +45,7 @@ def save_sphere_figure(path: str | Path, robot: Robot, q: Tensor | None = None) 
     centres, radii = robot.spheres(q)
     ball = trimesh.creation.icosphere(subdivisions=1)
     spheres = [ball.triangles * float(r) + c for c, r in zip(centres.numpy(), radii, strict=True)]
-    figure = Figure(figsize=(11, 12), layout="constrained")
+    figure = RobotFigure(figsize=(11, 12), layout="constrained")
     for row, (elevation, azimuth) in enumerate(VIEWS):
         for extra in (0, 1):
             axes = figure.add_subplot(2, 2, 2 * row + extra + 1, projection="3d")
@@ -43,7 +58,7 @@ def save_sphere_figure(path: str | Path, robot: Robot, q: Tensor | None = None) 
             axes.set_title(f"{len(radii)} spheres" if extra else "convex hulls", fontsize=10)
             _fit_axes(axes, np.concatenate([part.reshape(-1, 3) for part in hulls + spheres]))
     figure.suptitle(robot.name)
-    figure.savefig(path, dpi=110)
+    return figure
 
 
 def _draw(axes: Axes3D, parts: list[np.ndarray], colour: str, opacity: float, order: int) -> None:

@@ -27,7 +27,7 @@ def read_pose_topic(
     stamps, numbers, child = [], [], ""
     for message, stamp in messages:
         stamps.append(stamp)
-        numbers.append(_position_and_quaternion(message))
+        numbers.append(position_and_quaternion(message))
         child = getattr(message, "child_frame_id", "").strip("/")
     table = np.array(numbers, dtype=np.float64).reshape(-1, 7)
     return np.array(stamps, dtype=np.float64), from_quaternions(table[:, :3], table[:, 3:]), child
@@ -46,7 +46,7 @@ class TransformTree:
         """Take in one TFMessage."""
         for t in message.transforms:
             stamp = t.header.stamp.sec + 1e-9 * t.header.stamp.nanosec
-            edge = (t.header.frame_id.strip("/"), static, stamp, _position_and_quaternion(t))
+            edge = (t.header.frame_id.strip("/"), static, stamp, position_and_quaternion(t))
             self._edges.setdefault(t.child_frame_id.strip("/"), []).append(edge)
 
     def poses(
@@ -86,7 +86,7 @@ class TransformTree:
         return out
 
 
-def _position_and_quaternion(message: Any) -> tuple[float, ...]:
+def position_and_quaternion(message: Any) -> tuple[float, ...]:
     """(x, y, z, qx, qy, qz, qw) of any of the pose messages."""
     if hasattr(message, "transform"):
         p, q = message.transform.translation, message.transform.rotation

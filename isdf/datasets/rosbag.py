@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import logging
 import weakref
 from collections.abc import Iterator
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
 
 from ..camera import PinholeCamera
-from ..errors import CameraError, DatasetError
+from ..errors import DatasetError
 from ..frames import DepthFrame
 from .poses import poses_at
+from .ros_messages import SCALES, camera_from_info, decode_depth, header_time
 from .ros_poses import POSE_TYPES, TF_TYPES, TransformTree, read_pose_topic
 from .sequence import frame_clock
 
-logger = logging.getLogger(__name__)
-
 IMAGE, COMPRESSED, CAMERA_INFO = (f"sensor_msgs/msg/{n}" for n in ("Image", "CompressedImage", "CameraInfo"))
-# REP 118: depth images are 32FC1 in metres or 16UC1 in millimetres; some drivers call the latter mono16.
-SCALES = {"32FC1": 1.0, "16UC1": 1000.0, "mono16": 1000.0}
 SUFFIXES = (".bag", ".mcap", ".db3")
-COMPRESSED_HEADER = 12  # bytes that compressed_depth_image_transport writes before the PNG
 INSTALL = "reading ROS bags needs the rosbags package: pip install 'isdf-planning[readers]'"
 
 
@@ -157,17 +150,7 @@ class RosbagSequence:
         _, info = next(self._messages(self._of_topic(topic, (CAMERA_INFO,))), (0, None))
         if info is None:
             raise DatasetError(f"{self.folder}: no message on {topic}")
-        # ROS 1 writes the matrices' names in capitals.
-        K, P, D = (np.asarray(getattr(info, n, getattr(info, n.lower(), ()))) for n in "KPD")
-        rectified = "image_rect" in self.depth_topic and P.any()
-        if D.any() and not rectified:
-            logger.warning("%s: the lens distortion of %s is not corrected", self.folder, topic)
-        M = P.reshape(3, 4) if rectified else K.reshape(3, 3)
-        try:
-            fx, fy, cx, cy = (float(v) for v in (M[0, 0], M[1, 1], M[0, 2], M[1, 2]))
-            return PinholeCamera(fx, fy, cx, cy, int(info.width), int(info.height))
-        except CameraError as error:
-            raise DatasetError(f"{self.folder}: {topic}: {error}") from error
+        return camera_from_info(info, "image_rect" in self.depth_topic, f"{self.folder}: {topic}")
 
     def _read_poses(
         self,
@@ -195,42 +178,6 @@ class RosbagSequence:
             return poses
         source = f"{self.folder}: {topic} tracks {child!r}, the images are from {frame!r}; without T_body_camera, tf"
         return poses @ tf.poses(frame, child, times, tolerance, source)
-
-
-def header_time(message: Any, bag_time: int) -> float:
-    """When a message's content was measured [s]; the time it was recorded where its header says nothing."""
-    stamp = message.header.stamp
-    nanoseconds = stamp.sec * 1_000_000_000 + stamp.nanosec
-    return (nanoseconds or bag_time) * 1e-9
-
-
-def decode_depth(message: Any, name: str) -> Float[np.ndarray, "h w"]:
-    """An Image or compressedDepth message in metres; 0 or NaN where invalid."""
-    if not hasattr(message, "encoding"):
-        if not message.format.startswith("16UC1"):
-            raise DatasetError(
-                f"{name}: compressed as {message.format!r}; only 16UC1 compressedDepth can be read"
-            )
-        try:
-            with Image.open(BytesIO(bytes(message.data[COMPRESSED_HEADER:]))) as image:
-                return np.array(image).astype(np.float32) / SCALES["16UC1"]
-        except (OSError, SyntaxError) as error:
-            raise DatasetError(f"{name}: not a readable PNG ({error})") from error
-    if message.encoding not in SCALES:
-        raise DatasetError(
-            f"{name}: encoding {message.encoding!r} is no depth; expected one of {', '.join(SCALES)}"
-        )
-    kind = np.dtype("f4" if message.encoding == "32FC1" else "u2").newbyteorder(
-        ">" if message.is_bigendian else "<"
-    )
-    try:
-        rows = np.asarray(message.data).reshape(message.height, message.step)[
-            :, : message.width * kind.itemsize
-        ]
-        depth = np.ascontiguousarray(rows).view(kind).astype(np.float32)
-    except ValueError as error:
-        raise DatasetError(f"{name}: its data does not fit its size ({error})") from error
-    return depth / SCALES[message.encoding]
 
 
 def _open_reader(path: Path) -> Any:

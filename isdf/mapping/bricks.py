@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from numba import njit
 
 from ..errors import FrameError
+from ..extent import fits
 
 SIDE = 8
 VOXELS = SIDE**3
@@ -88,20 +89,21 @@ class BrickVolume:
             FrameError: that would take more than `max_bricks` entries; nothing has changed.
         """
         edge = SIDE * self.voxel * GROWTH
-        first = np.floor(np.asarray(lower) / edge - 0.5).astype(np.int64) * GROWTH
-        last = np.ceil(np.asarray(upper) / edge + 0.5).astype(np.int64) * GROWTH
+        low = np.floor(np.asarray(lower) / edge - 0.5) * GROWTH
+        high = np.ceil(np.asarray(upper) / edge + 0.5) * GROWTH
         if self.table.size:
-            first = np.minimum(first, self.corner)
-            last = np.maximum(last, self.corner + self.table.shape)
-        size = last - first
+            low = np.minimum(low, self.corner)
+            high = np.maximum(high, self.corner + self.table.shape)
+        size = high - low
         if np.array_equal(size, self.table.shape):
             return
-        if float(np.prod(size.astype(float))) > self.max_bricks:
+        if not fits(low, high, self.max_bricks):
             sides = " x ".join(f"{s * SIDE * self.voxel:.0f}" for s in size)
             raise FrameError(
                 f"this frame would make the map {sides} m, more than max_bricks = {self.max_bricks}; if its pose is "
                 "right, raise that or choose a smaller max_depth"
             )
+        first, size = low.astype(np.int64), size.astype(np.int64)
         self.table = moved(self.table, self.corner, first, size, -1)
         self.corner = first
 
@@ -186,9 +188,10 @@ def missing_bricks(bricks: Bricks, depth, stride, noise, least, intrinsics, T_wo
                 continue
             band = max(least, noise * z * z)
             a, b = (u - cx) / fx, (v - cy) / fy
-            steps = int(np.ceil(2 * band / (0.4 * edge)))
+            near = max(0.0, z - band)  # what lies behind the camera is never fused
+            steps = int(np.ceil((z + band - near) / (0.4 * edge)))
             for n in range(steps + 1):
-                w = z - band + 2 * band * n / steps
+                w = near + (z + band - near) * n / steps
                 i = int(np.floor((R[0, 0] * a + R[0, 1] * b + R[0, 2]) * w / edge + t[0] / edge)) - corner[0]
                 j = int(np.floor((R[1, 0] * a + R[1, 1] * b + R[1, 2]) * w / edge + t[1] / edge)) - corner[1]
                 k = int(np.floor((R[2, 0] * a + R[2, 1] * b + R[2, 2]) * w / edge + t[2] / edge)) - corner[2]

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int8, UInt8
 
 from ..errors import FrameError
+from ..extent import fits
 from .bricks import moved
 
 # Fine nodes a side of a refined cell: a cell of four fine steps shares its faces with its neighbours.
@@ -84,19 +85,20 @@ class Lattice:
             FrameError: that would take more than `MAX_NODES`; nothing has changed.
         """
         edge = self.spacing * GROWTH
-        first = np.floor(np.asarray(lower) / edge).astype(np.int64) * GROWTH
-        last = np.ceil(np.asarray(upper) / edge).astype(np.int64) * GROWTH
+        low = np.floor(np.asarray(lower) / edge) * GROWTH
+        high = np.ceil(np.asarray(upper) / edge) * GROWTH
         if self.value.size:
-            first = np.minimum(first, self.corner)
-            last = np.maximum(last, self.corner + self.shape)
-        size = last - first
+            low = np.minimum(low, self.corner)
+            high = np.maximum(high, self.corner + self.shape)
+        size = high - low
         if np.array_equal(size, self.shape):
             return
-        if float(np.prod(size.astype(float))) > MAX_NODES:
+        if not fits(low, high, MAX_NODES):
             raise FrameError(
                 f"this frame would make the map {' x '.join(f'{s * self.spacing:.0f}' for s in size)} m, more than "
                 f"{MAX_NODES} nodes {self.spacing:.3g} m apart; if its pose is right, choose a larger voxel"
             )
+        first, size = low.astype(np.int64), size.astype(np.int64)
         for name, empty in (
             ("value", 1.0), ("confidence", 0), ("block", -1), ("evidence", 0), ("share", 0.5), ("width", -0.7)
         ):  # fmt: skip

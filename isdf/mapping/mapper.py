@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..camera import PinholeCamera
 from ..cost import CostField
+from ..display import ShownMapper
 from ..errors import ConfigError, FrameError, NotReadyError
 from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
@@ -98,7 +99,7 @@ class MapperConfig:
                 raise ConfigError(f"{name} must be zero or more, got {getattr(self, name)}")
 
 
-class Mapper:
+class Mapper(ShownMapper):
     """Maps posed depth images online: fuse each, write distances down now and then, guess between bounds.
 
     `integrate` fuses at once and refreshes the distances when `refresh_period` of frame time has passed; `step` and

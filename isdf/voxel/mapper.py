@@ -16,13 +16,14 @@ from torch import Tensor
 
 from .. import mapfile
 from ..cost import CostField
+from ..display import ShownMapper
 from ..errors import CheckpointError, ConfigError, NotReadyError
 from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
 from .volume import GrowingVolume
 
 
-class VoxelMapper(abc.ABC):
+class VoxelMapper(ShownMapper, abc.ABC):
     """Base of the voxel maps; the interface of `isdf.Mapper`, but with nothing to train.
 
     `integrate` fuses at once and rebuilds the distances when `rebuild_period` of frame time has passed since the

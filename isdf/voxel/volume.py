@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import ConfigError, FrameError
+from ..extent import fits
 from ..frames import DepthFrame
 
 # The volume grows by whole blocks of this edge [voxels], so that it is seldom moved.
@@ -66,20 +67,21 @@ class GrowingVolume:
         Raises:
             FrameError: that would take more than `max_voxels`; nothing has changed.
         """
-        first = np.floor(lower / self.voxel / GROWTH).astype(np.int64) * GROWTH
-        last = np.ceil((upper / self.voxel + 1) / GROWTH).astype(np.int64) * GROWTH
+        low = np.floor(lower / self.voxel / GROWTH) * GROWTH
+        high = np.ceil((upper / self.voxel + 1) / GROWTH) * GROWTH
         if 0 not in self.shape:
-            first = np.minimum(first, self.corner)
-            last = np.maximum(last, self.corner + self.shape)
-        size = last - first
+            low = np.minimum(low, self.corner)
+            high = np.maximum(high, self.corner + self.shape)
+        size = high - low
         if np.array_equal(size, self.shape):
             return
-        if float(np.prod(size.astype(float))) > self.max_voxels:
+        if not fits(low, high, self.max_voxels):
             raise FrameError(
                 f"this frame would make the map {' x '.join(f'{s * self.voxel:.1f}' for s in size)} m, more than "
                 f"max_voxels = {self.max_voxels} of {self.voxel} m; if its pose is right, choose a larger voxel or "
                 "a smaller max_depth"
             )
+        first, size = low.astype(np.int64), size.astype(np.int64)
         offset = self.corner - first
         inner = tuple(slice(o, o + n) for o, n in zip(offset, self.shape, strict=True))
         for name, old in self.channels.items():

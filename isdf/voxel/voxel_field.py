@@ -9,11 +9,12 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from ..display import ShownField
 from ..field import GridField, check_points
 from .nearest_seed import observed_at
 
 
-class VoxelField:
+class VoxelField(ShownField):
     """Trilinear distances between voxel centres, and what of them was observed; immutable.
 
     Where a distance is NaN the value of the nearest voxel that has one stands in, as in the paper's evaluation of

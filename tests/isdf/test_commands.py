@@ -88,8 +88,24 @@ def test_faults_are_one_line_for_people_and_one_for_machines(
 def test_a_misspelled_option_is_answered_with_the_right_one(map_path, monkeypatch, capsys) -> None:
     code, _, error = run(monkeypatch, capsys, "map", "x", "--out", "y", "--steps-per-fram", 3)
     assert code == 2 and "--steps-per-frame" in error
-    code, _, error = run(monkeypatch, capsys, "exprt", map_path)
-    assert code == 2 and "map, query, export, info" in error
+    code, out, error = run(monkeypatch, capsys, "map", "x", "--out", "y", "--steps-per-fram", 3, "--json")
+    assert code == 2 and "--steps-per-frame" in json.loads(error)["message"] and out == ""
+
+
+@pytest.mark.parametrize(("word", "meant"), [("exprt", "export"), ("qeury", "query"), ("maps", "map")])
+def test_a_misspelled_command_is_answered_with_the_right_one(word, meant, monkeypatch, capsys) -> None:
+    code, _, error = run(monkeypatch, capsys, word, "x")
+    assert code == 2 and f"did you mean {meant}?" in error and "map, query, export, info" in error
+    code, _, error = run(monkeypatch, capsys, "zzz", "x")
+    assert code == 2 and "did you mean" not in error and "map, query, export, info" in error
+
+
+@pytest.mark.parametrize("words", [("--help",), ("map", "--help"), ("export", "--help"), ("info", "--help")])
+def test_help_fits_a_narrow_terminal(words, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    code, text, _ = run(monkeypatch, capsys, *words)
+    assert code == 0 and max(len(line) for line in text.splitlines()[2:]) <= 80
+    assert text.count("\n") < 110
 
 
 def test_newer_damaged_and_oversized_files_are_refused(map_path, tmp_path) -> None:
@@ -104,8 +120,12 @@ def test_newer_damaged_and_oversized_files_are_refused(map_path, tmp_path) -> No
     flipped[-7] ^= 4
     huge = good.replace(b'"shape":[2,3]', b'"shape":[2,3000000000]')
     long = (1 << 40).to_bytes(8, "little") + good[8:]
+    for version, fault in ((99, "99 is newer than"), (-1, "-1 is older than"), ("1", "'1' is no version")):
+        write(path, tensors, header | {"version": version})
+        with pytest.raises(CheckpointError, match=fault):
+            load_map(path)
     for data, fault in (
-        (newer, "9 is newer"),
+        (newer, "file version 9 is newer .*update the package"),
         (bytes(flipped), "checksum"),
         (good[:-1], "are there"),
         (huge, "not a readable map"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from robots.link_pairs import PairConfig, pair_reasons
 
 Run = Callable[..., tuple[int, str, str]]
 
+FIT_PROGRESS: list[tuple[int, ...]] = []
 BAR = '<collision><origin xyz="0 0 0.15"/><geometry><box size="0.04 0.04 0.3"/></geometry></collision>'
 HINGE = (
     '<joint name="j{1}" type="revolute"><origin xyz="0 0 0.35"/><parent link="{0}"/><child link="{1}"/>'
@@ -36,7 +38,7 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def fitted(urdf: Path) -> robots.Robot:
     config = robots.RobotFitConfig(pairs=PairConfig(samples=500))
-    spheres, _ = robots.fit_robot(urdf, 36, config=config)
+    spheres, _ = robots.fit_robot(urdf, 36, config=config, progress=lambda *told: FIT_PROGRESS.append(told))
     return robots.Robot.from_urdf(urdf, spheres)
 
 
@@ -94,6 +96,10 @@ def test_the_command_fits_then_checks(run: Run, urdf: Path, tmp_path: Path) -> N
     code, text, _ = run("fit", str(urdf), "--out", str(out), "--budget", "24")
     assert code == 0 and "overshoot" in text
     assert len(robots.load_spheres(out)) <= 24 and out.with_suffix(".png").stat().st_size > 10_000
+    code, text, _ = run("check", str(urdf), str(out), "--configurations", "20", "--json")
+    told = json.loads(text)
+    assert code == 0 and told["safe"] and told["configurations"] == 20 and told["max_uncovered"] < 2e-3
+    assert sum(body["spheres"] for body in told["bodies"].values()) == len(robots.load_spheres(out))
     code, text, _ = run("check", str(urdf), str(out), "--configurations", "20")
     assert code == 0 and re.search(r"verdicts differ in \d+", text) and "2 adjacent" in text
     out.write_text(re.sub(r"radius: [\d.]+", "radius: 0.005", out.read_text()))
@@ -109,8 +115,23 @@ def test_the_command_fits_then_checks(run: Run, urdf: Path, tmp_path: Path) -> N
         (("check", "panda", "--write-pairs"), "sphere file"),
         (("fit", "nothing.urdf", "--out", "s.yaml"), "nothing.urdf"),
         (("fit", "nothing.urdf", "--out", "s.yaml", "--gap", "0.1"), "--gap"),
+        (("chek", "panda"), "did you mean check?"),
     ],
 )
 def test_bad_requests_are_explained(run: Run, arguments: tuple[str, ...], message: str) -> None:
-    code, _, error = run(*arguments)
-    assert code == 2 and message in error
+    code, out, error = run(*arguments)
+    assert code == 2 and message in error and error.count("\n") == 1 and out == ""
+    code, out, error = run(*arguments, "--json")
+    assert code == 2 and message in json.loads(error)["message"] and out == ""
+
+
+def test_a_misspelled_option_is_answered_with_the_right_one(run: Run) -> None:
+    code, _, error = run("check", "panda", "--configuration", "5")
+    assert code == 2 and "--configurations" in error
+
+
+def test_progress_reaches_the_whole(fitted: robots.Robot) -> None:
+    assert [(n, 36) for n in range(4, 37)] == FIT_PROGRESS
+    told: list[tuple[int, int]] = []
+    check_spheres(fitted, 6, progress=lambda *done: told.append(done))
+    assert told == [(n, 6) for n in range(1, 7)]

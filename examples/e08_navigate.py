@@ -1,0 +1,82 @@
+"""8. The closed loop on one page: sense, map, plan, follow, until the goal is reached.
+
+    python -m examples.e08_navigate --out runs/e08 --scene office --seed 3
+
+Leaves states.npz and way.png. `examples.navigate` is the same with a report, a film, and more to choose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+import isdf
+from examples.episode import ROBOT_HEIGHT, Episode, EpisodeOptions
+from planning.drive import DriveReport
+from planning.protocols import DistanceField
+from planning.replanning import ReplanningConfig, ReplanningLoop
+
+
+@dataclass(frozen=True)
+class Drive(EpisodeOptions):
+    """Map an unknown furnished room and drive to a goal in it."""
+
+    time_limit: float = 180.0
+    """Of the robot's time [s]."""
+
+
+def main(options: Drive) -> DriveReport:
+    """Drive; returns what happened."""
+    torch.set_num_threads(1)
+    episode, mapper = Episode(options), isdf.Mapper()
+    if episode.scene.goal is None:
+        raise SystemExit(f"{options.scene} has no goal of its own; `examples.navigate` takes --goal X Y")
+    goal = np.array(episode.scene.goal[:2])
+
+    def field_for_driving() -> DistanceField:
+        """The newest map up to the robot's height, on a grid: a base asks it at many thousand places a plan."""
+        bounds = mapper.bounds
+        bounds[0, 2], bounds[1, 2] = 0.0, ROBOT_HEIGHT
+        return mapper.field().bake(0.08, bounds, padding=0.1)
+
+    with tqdm(desc="driving", unit=" rounds", disable=None) as bar:
+
+        def watch(_: ReplanningLoop) -> None:
+            left = np.linalg.norm(episode.robot.base_state()[:2] - goal)
+            bar.set_postfix_str(f"t = {episode.robot.time:.0f} s, {left:.1f} m to go")
+            bar.update()
+
+        loop = ReplanningLoop(
+            episode.robot,  # senses and drives
+            episode.body,  # its spheres at every heading
+            mapper,  # learns from the frames
+            field_for_driving,  # what is planned in
+            ReplanningConfig(time_limit=options.time_limit),
+            options.clock(),  # what computing costs the robot in time
+            watch,
+        )
+        report = loop.drive_to(goal)
+    print(
+        f"{report.status.value}: {report.path_length:.1f} m in {report.duration:.0f} s, {report.plans} plans"
+    )
+    print(f"contacts: {episode.contacts() or 'none'}; {mapper}")
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    episode.robot.recording.save(options.out / "states.npz")
+    figure = mapper.field().plot_slice(0.5)
+    driven = episode.robot.recording.base_poses()
+    axes = figure.axes[0]
+    axes.plot(driven[:, 0], driven[:, 1], color="red")
+    axes.plot(*goal, "*", color="gold", markersize=14, markeredgecolor="black")
+    figure.savefig(options.out / "way.png")
+    episode.close()
+    return report
+
+
+if __name__ == "__main__":
+    chosen = tyro.cli(Drive, description=__doc__)
+    raise SystemExit(0 if main(chosen).success else 1)
