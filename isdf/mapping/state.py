@@ -14,8 +14,9 @@ from torch import Tensor
 
 from ..errors import CheckpointError
 from ..mapfile import consistent, read, write
+from .config import MapperConfig
 from .lattice import BLOCK
-from .mapper import Mapper, MapperConfig
+from .mapper import Mapper
 
 FORMAT = "isdf-lattice-map"
 VERSION = 1
