@@ -104,6 +104,7 @@ class Mapper:
         stride = max(1, depth.shape[1] // COLUMNS)
         appeared = self._appeared(depth, T, stride, frame)
         if appeared is None:
+            self._keep_up(frame.time)
             return
         box = self._view(depth, T, frame)
         self.bricks.include(box[0], box[1])
@@ -121,9 +122,7 @@ class Mapper:
         if not self._ready or not 0 < frame.time - self._guessed_at < self.config.guess_period:
             self._guess(T[:3, 3])
             self._guessed_at = frame.time
-        if not self._ready or not 0 < frame.time - self._refreshed_at < self.config.refresh_period:
-            self.refresh()
-            self._refreshed_at = frame.time
+        self._keep_up(frame.time)
 
     def refresh(self) -> None:
         """Bring the distances up to date with all frames so far."""
@@ -152,16 +151,19 @@ class Mapper:
         """
         if not self._ready:
             raise NotReadyError("no surface was seen yet: call mapper.integrate(frame) first")
-        lattice = self.lattice
-        return LatticeField(
-            lattice.value.copy(),
-            lattice.confidence.copy(),
-            lattice.block.copy(),
-            lattice.corrections[: lattice.used].copy(),
+        lattice, nodes = self.lattice, self.lattice.nodes.arrays
+        snapshot = LatticeField(
+            lattice.table.copy(),
+            nodes["value"],
+            nodes["confidence"],
+            nodes["block"],
+            lattice.corrections,
             lattice.corner.copy(),
             lattice.spacing,
             self._bounds,
         )
+        lattice.readers.add(snapshot)
+        return snapshot
 
     def cost_field(self, eps: float) -> CostField:
         """The CHOMP collision cost c(f(x)) with reach `eps` [m], over a snapshot of the field."""
@@ -262,23 +264,23 @@ class Mapper:
         inverse = np.linalg.inv(T)
         fuse(bricks.arrays, *bricks.box(*box), depth, *band, config.max_weight, intrinsics, inverse)
         begin, end = lattice.window(*box)
+        evidence = lattice.read("evidence", begin, end)
+        first, size = lattice.corner + begin, end - begin
         look_through(
-            lattice.evidence,
-            lattice.corner,
-            lattice.spacing,
-            begin,
-            end,
-            depth,
-            appeared,
-            stride,
-            intrinsics,
-            inverse,
-        )
+            evidence, first, lattice.spacing, 0 * size, size, depth, appeared, stride, intrinsics, inverse
+        )  # fmt: skip
+        lattice.write(begin, end, evidence=evidence)
 
     def _guess(self, eye: Float[np.ndarray, "3"]) -> None:
         box = guess(self.lattice, self.bricks, self.network, eye, self.up)
         if box is not None:
             self._touch(box)
+
+    def _keep_up(self, now: float) -> None:
+        """Refresh when it is due, whether the newest frame was believed or not."""
+        if not self._ready or not 0 < now - self._refreshed_at < self.config.refresh_period:
+            self.refresh()
+            self._refreshed_at = now
 
     def _touch(self, box: np.ndarray) -> None:
         """Have a box (2, 3) [m] refreshed with the next refresh."""

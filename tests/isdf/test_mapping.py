@@ -92,7 +92,8 @@ def test_guesses_beat_the_distance_to_what_was_seen():
 def test_truth_lies_between_the_bounds(orbit):
     lattice, bricks = orbit.lattice, orbit.bricks
     seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(np.full(3, -9.0), np.full(3, 9.0)))
-    proven = gather(seeds, lattice.evidence, lattice.corner, lattice.spacing)
+    evidence = lattice.read("evidence", np.zeros(3, dtype=int), np.array(lattice.shape))
+    proven = gather(seeds, evidence, lattice.corner, lattice.spacing)
     nodes = lattice.spacing * (lattice.corner + np.argwhere(np.ones(lattice.shape, dtype=bool)))
     inside = (np.abs(nodes) < [2.5, 2.0, 9]).all(axis=1) & (nodes[:, 2] > 0) & (nodes[:, 2] < 2.5)
     truth = furnished_room()(torch.from_numpy(nodes)).numpy()[inside]
