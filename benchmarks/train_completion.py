@@ -182,9 +182,10 @@ def windows(rng: np.random.Generator) -> Iterator[tuple[torch.Tensor, torch.Tens
     moments = {int(rng.integers(1, 5)), int(rng.integers(5, 14)), len(poses)}
     for count, T in enumerate(poses, start=1):
         depth = depth_image(*solids, T, camera, *IMAGE, 0.15, far)
+        nothing = np.zeros(depth.shape, dtype=bool)  # came into free space
         look_through(
-            evidence, corner, SPACING, np.zeros(3, np.int64), WINDOW, depth, camera, np.linalg.inv(T)
-        )
+            evidence, corner, SPACING, np.zeros(3, np.int64), WINDOW, depth, nothing, 1, camera, np.linalg.inv(T)
+        )  # fmt: skip
         points = np.concatenate([points, seen(depth, T, camera, rng)])
         if count in moments and len(points) > 50:
             points = points[np.unique(np.round(points / 0.04).astype(int), axis=0, return_index=True)[1]]

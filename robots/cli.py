@@ -155,7 +155,7 @@ def _bar(title: str) -> Iterator[Callable[[int, int], None]]:
         yield progress
 
 
-def _fit_data(fits: Mapping[str, SphereFit]) -> dict[str, dict[str, float]]:
+def _fit_data(fits: Mapping[str, SphereFit]) -> dict[str, dict[str, float | int]]:
     """The same as `_fit_table` for machines; lengths in metres."""
     names = ("coverage", "max_uncovered", "overshoot_mean", "overshoot_p95", "overshoot_max")
     return {

@@ -33,13 +33,14 @@ def compare(lattice: LatticeArrays, bricks: Bricks, depth, stride, intrinsics, T
         T_world_camera: (4, 4).
 
     Returns:
-        `appeared` (h / stride, w / stride), share of contradictions, number of pixels that could be judged.
+        `appeared` (h / stride, w / stride), share of contradictions among the pixels that could be judged, and those as
+        a share of all with a depth.
     """
     fx, fy, cx, cy = intrinsics
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
     rows, columns = -(-depth.shape[0] // stride), -(-depth.shape[1] // stride)
     appeared = np.zeros((rows, columns), dtype=np.bool_)
-    known, against = 0, 0
+    known, against, valid = 0, 0, 0
     ray, point = np.empty(3), np.empty(3)
     for row in range(rows):
         for column in range(columns):
@@ -47,6 +48,7 @@ def compare(lattice: LatticeArrays, bricks: Bricks, depth, stride, intrinsics, T
             z = depth[v, u]
             if z <= 0:
                 continue
+            valid += 1
             a, b = (u - cx) / fx, (v - cy) / fy
             clear = CLEAR + CLEAR_NOISE * z * z
             for axis in range(3):
@@ -72,4 +74,4 @@ def compare(lattice: LatticeArrays, bricks: Bricks, depth, stride, intrinsics, T
                 against += 1
             if through or (sure >= SURE and abs(distance) < clear):
                 known += 1
-    return appeared, against / max(known, 1), known
+    return appeared, against / max(known, 1), known / max(valid, 1)

@@ -12,7 +12,7 @@ from numba import njit
 from torch import Tensor
 
 from ..field import AnalyticField, check_points
-from .lattice import FINE, STEP, LatticeArrays
+from .lattice import BLOCK, CHUNK, FINE, STEP, LatticeArrays, node_at
 
 # Below this many points a second thread costs more than it saves.
 PARALLEL = 20_000
@@ -24,33 +24,40 @@ class LatticeField(AnalyticField):
     Outside the lattice the distance is that of the closest point on its rim, and the gradient across it is zero.
 
     Args:
-        value: (nx, ny, nz) signed distances at the coarse nodes [m].
+        table: (cx, cy, cz) row of every chunk of 8 x 8 x 8 coarse nodes, -1 where there is none.
+        value: (rows, 512) signed distances at the coarse nodes [m].
         confidence: of the same nodes, 255 is 1.
-        block: of the same nodes: number of the cell's corrections, -1 where there are none.
+        block: of the same nodes: row of the cell's corrections, -1 where there are none.
         corrections: (n, 125) what trilinear interpolation misses at the fine nodes of a cell, in `lattice.STEP`s.
         corner: (3,) lattice index of the first node.
         spacing: of coarse nodes [m].
         bounds: (2, 3) lower and upper corner of what was observed [m].
+
+    The arrays may have rows that belong to the map or to other snapshots: none that this one reads is ever written.
     """
 
     def __init__(
         self,
-        value: Float[np.ndarray, "nx ny nz"],
-        confidence: UInt8[np.ndarray, "nx ny nz"],
-        block: Int[np.ndarray, "nx ny nz"],
+        table: Int[np.ndarray, "cx cy cz"],
+        value: Float[np.ndarray, "rows 512"],
+        confidence: UInt8[np.ndarray, "rows 512"],
+        block: Int[np.ndarray, "rows 512"],
         corrections: Int8[np.ndarray, "n 125"],
         corner: Int[np.ndarray, "3"],
         spacing: float,
         bounds: Float[Tensor, "2 3"],
     ) -> None:
-        self._value, self._confidence, self._block, self._corrections = value, confidence, block, corrections
+        self._table, self._value, self._confidence = table, value, confidence
+        self._block, self._corrections = block, corrections
         self._origin, self.spacing = np.asarray(corner) * spacing, float(spacing)
         self.bounds = bounds.clone()
 
     @property
     def nbytes(self) -> int:
         """Memory of all that queries need [bytes]."""
-        return sum(a.nbytes for a in (self._value, self._confidence, self._block, self._corrections))
+        rows = self._table[self._table >= 0]
+        nodes = sum(a.itemsize for a in (self._value, self._confidence, self._block)) * CHUNK**3
+        return self._table.nbytes + len(rows) * nodes + int((self._block[rows] >= 0).sum()) * BLOCK
 
     def distance_and_gradient(
         self, points: Float[Tensor, "*batch 3"]
@@ -70,12 +77,12 @@ class LatticeField(AnalyticField):
         check_points(points)
         flat = points.detach().cpu().numpy().reshape(-1, 3)
         out = np.empty(len(flat), np.float32)
-        _confidence(flat, self._origin, self.spacing, self._confidence, out)
+        _confidence(flat, self._origin, self.spacing, self._table, self._confidence, out)
         return torch.from_numpy(out).to(points).view(points.shape[:-1])
 
     def _split(self, kernel: Any, points: np.ndarray, distance: np.ndarray, gradient: np.ndarray) -> None:
         """Run a kernel over the points in as many threads as torch uses."""
-        state = (self._origin, self.spacing, self._value, self._block, self._corrections)
+        state = (self._origin, self.spacing, self._table, self._value, self._block, self._corrections)
         threads = torch.get_num_threads()
         if threads == 1 or len(points) < PARALLEL:
             kernel(points, *state, distance, gradient)
@@ -87,9 +94,10 @@ class LatticeField(AnalyticField):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _query(points, origin, spacing, value, block, corrections, distance, gradient):
+def _query(points, origin, spacing, table, value, block, corrections, distance, gradient):
     """Distances (n,) and gradients (n, 3) of points (n, 3), written in place."""
-    nx, ny, nz = value.shape
+    nx, ny, nz = CHUNK * table.shape[0], CHUNK * table.shape[1], CHUNK * table.shape[2]
+    far = np.float32(1)
     parts = FINE - 1
     per = np.float32(1 / spacing)
     scale = np.float32(STEP)
@@ -107,11 +115,13 @@ def _query(points, origin, spacing, value, block, corrections, distance, gradien
         i, j, k = min(int(cx), nx - 2), min(int(cy), ny - 2), min(int(cz), nz - 2)
         tx, ty, tz = cx - np.float32(i), cy - np.float32(j), cz - np.float32(k)
         d, gx, gy, gz = _trilinear(
-            value[i, j, k], value[i, j, k + 1], value[i, j + 1, k], value[i, j + 1, k + 1],
-            value[i + 1, j, k], value[i + 1, j, k + 1], value[i + 1, j + 1, k], value[i + 1, j + 1, k + 1],
+            node_at(table, value, i, j, k, far), node_at(table, value, i, j, k + 1, far),
+            node_at(table, value, i, j + 1, k, far), node_at(table, value, i, j + 1, k + 1, far),
+            node_at(table, value, i + 1, j, k, far), node_at(table, value, i + 1, j, k + 1, far),
+            node_at(table, value, i + 1, j + 1, k, far), node_at(table, value, i + 1, j + 1, k + 1, far),
             tx, ty, tz,
         )  # fmt: skip
-        m = block[i, j, k]
+        m = node_at(table, block, i, j, k, np.int32(-1))
         if m >= 0:
             tx, ty, tz = tx * parts, ty * parts, tz * parts
             a, b, c = min(int(tx), parts - 1), min(int(ty), parts - 1), min(int(tz), parts - 1)
@@ -145,9 +155,9 @@ def _trilinear(v000, v001, v010, v011, v100, v101, v110, v111, x, y, z):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _confidence(points, origin, spacing, confidence, out):
+def _confidence(points, origin, spacing, table, confidence, out):
     """Trilinear confidences (n,) of points (n, 3), 0 outside the lattice and where a point is not finite."""
-    nx, ny, nz = confidence.shape
+    nx, ny, nz = CHUNK * table.shape[0], CHUNK * table.shape[1], CHUNK * table.shape[2]
     for n in range(points.shape[0]):
         x = (points[n, 0] - origin[0]) / spacing
         y = (points[n, 1] - origin[1]) / spacing
@@ -162,7 +172,7 @@ def _confidence(points, origin, spacing, confidence, out):
             for b in range(2):
                 for c in range(2):
                     w = (tx if a else 1 - tx) * (ty if b else 1 - ty) * (tz if c else 1 - tz)
-                    total += w * confidence[i + a, j + b, k + c]
+                    total += w * node_at(table, confidence, i + a, j + b, k + c, np.uint8(0))
         out[n] = total / 255
 
 
@@ -173,16 +183,19 @@ def query_one(lattice: LatticeArrays, point):
     at, t = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.float32)
     for axis in range(3):
         place = (point[axis] - lattice.origin[axis]) / lattice.spacing
-        if not 0 <= place < lattice.value.shape[axis] - 1:
+        if not 0 <= place < CHUNK * lattice.table.shape[axis] - 1:
             return np.float32(0), 0, False
         at[axis] = int(place)
         t[axis] = place - at[axis]
     i, j, k = at
-    v = lattice.value
+    n, v, far = lattice.table, lattice.value, np.float32(1)
     value, _, _, _ = _trilinear(
-        v[i, j, k], v[i, j, k + 1], v[i, j + 1, k], v[i, j + 1, k + 1],
-        v[i + 1, j, k], v[i + 1, j, k + 1], v[i + 1, j + 1, k], v[i + 1, j + 1, k + 1],
+        node_at(n, v, i, j, k, far), node_at(n, v, i, j, k + 1, far),
+        node_at(n, v, i, j + 1, k, far), node_at(n, v, i, j + 1, k + 1, far),
+        node_at(n, v, i + 1, j, k, far), node_at(n, v, i + 1, j, k + 1, far),
+        node_at(n, v, i + 1, j + 1, k, far), node_at(n, v, i + 1, j + 1, k + 1, far),
         t[0], t[1], t[2],
     )  # fmt: skip
     i, j, k = i + int(t[0] > 0.5), j + int(t[1] > 0.5), k + int(t[2] > 0.5)
-    return value, int(lattice.confidence[i, j, k]), lattice.evidence[i, j, k] > 127
+    sure = node_at(n, lattice.confidence, i, j, k, np.uint8(0))
+    return value, int(sure), node_at(n, lattice.evidence, i, j, k, np.uint8(0)) > 127

@@ -7,7 +7,6 @@ import logging
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +18,18 @@ from torch import Tensor
 from ..camera import PinholeCamera
 from ..cost import CostField
 from ..display import ShownMapper
-from ..errors import ConfigError, FrameError, NotReadyError
+from ..errors import FrameError, NotReadyError
 from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
-from ..numbers import require_finite
 from .agreement import compare
 from .bricks import BrickVolume, missing_bricks
 from .completion import load_network
+from .config import MapperConfig
 from .evidence import look_through
 from .field import LatticeField
 from .fusion import fuse
 from .lattice import Lattice
+from .motion import Moment, Motion
 from .refresh import guess, refresh
 
 logger = logging.getLogger(__name__)
@@ -40,63 +40,11 @@ RATIO = 4
 BEYOND_ACROSS, BEYOND_ALONG = 2.5, 1.5
 # Distances are written anew this far outside what a frame looked at [m].
 MARGIN = 0.8
-# A frame is passed over when more than this share of at least so many points contradicts the map, but no more than
-# so many frames in a row: then the world has changed, not the frame.
-CONTRADICTED, JUDGED, PATIENCE = 0.35, 60, 5
+# A frame is passed over when more than this share of its points contradicts the map, of those that can be judged by it,
+# which must be this share of all; but no more than so many frames in a row: then the world has changed, not the frame.
+CONTRADICTED, JUDGED, PATIENCE = 0.35, 0.25, 5
 # Columns of an image that are compared with the map.
 COLUMNS = 80
-
-
-# Four times the default limit; a brick takes four kilobytes, though most places never get one.
-MOST_BRICKS = 1 << 25
-
-
-@dataclass(frozen=True)
-class MapperConfig:
-    """Settings of the default map.
-
-    Args:
-        voxel: edge of a fine voxel [m]; the coarse nodes lie four of them apart, and the network knows no other.
-        truncation: least truncation of the fused distances [m].
-        truncation_noise: truncation per squared depth [m / m^2]: it follows the noise of far depth.
-        max_depth: pixels measured farther than this are ignored [m].
-        max_weight: of a voxel, in measurements at 1 m: enough to average the noise.
-        refresh_period: least frame time between two refreshes of the distances [s].
-        guess_period: least frame time between two runs of the network [s].
-        max_bricks: a frame that needs a larger table of bricks (of eight voxels a side) is refused.
-    """
-
-    voxel: float = 0.04
-    truncation: float = 0.12
-    truncation_noise: float = 0.012
-    max_depth: float = 10.0
-    max_weight: float = 20.0
-    refresh_period: float = 0.35
-    guess_period: float = 1.0
-    max_bricks: int = 8_000_000
-
-    def __post_init__(self) -> None:
-        require_finite(
-            self,
-            (
-                "guess_period",
-                "refresh_period",
-            ),
-        )
-        for name in ("voxel", "truncation", "max_depth", "max_weight", "max_bricks"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        if self.max_bricks > MOST_BRICKS:
-            raise ConfigError(
-                f"max_bricks must be at most {MOST_BRICKS}, got {self.max_bricks}: memory ends before"
-            )
-        if not self.truncation > 2 * self.voxel:
-            raise ConfigError(
-                f"truncation must be more than two voxels, got {self.truncation} m with a voxel of {self.voxel} m"
-            )
-        for name in ("refresh_period", "guess_period", "truncation_noise"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must be zero or more, got {getattr(self, name)}")
 
 
 class Mapper(ShownMapper):
@@ -127,7 +75,7 @@ class Mapper(ShownMapper):
         self._refreshed_at = self._guessed_at = -math.inf
         self._ready = False
         self._last: np.ndarray | None = None
-        self._frozen, self._refused = False, 0
+        self._frozen, self._refused, self._motion = False, 0, Motion()
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"]:
@@ -157,6 +105,7 @@ class Mapper(ShownMapper):
         stride = max(1, depth.shape[1] // COLUMNS)
         appeared = self._appeared(depth, T, stride, frame)
         if appeared is None:
+            self._keep_up(frame.time)
             return
         box = self._view(depth, T, frame)
         self.bricks.include(box[0], box[1])
@@ -167,15 +116,14 @@ class Mapper(ShownMapper):
         self.lattice.include(np.minimum(seen[0] - beyond, box[0]), np.maximum(seen[1] + beyond, box[1]))
         self._bounds, self.up = bounds, up
         self._fuse(depth, T, frame, box, appeared, stride)
+        self._motion.believe(Moment(depth, _intrinsics(frame), T, frame.time))
         self.frames_seen += 1
         self._touch(box + np.array([[-MARGIN], [MARGIN]]))
         # A clock that stands still or jumps back must not stop the refreshing.
         if not self._ready or not 0 < frame.time - self._guessed_at < self.config.guess_period:
             self._guess(T[:3, 3])
             self._guessed_at = frame.time
-        if not self._ready or not 0 < frame.time - self._refreshed_at < self.config.refresh_period:
-            self.refresh()
-            self._refreshed_at = frame.time
+        self._keep_up(frame.time)
 
     def refresh(self) -> None:
         """Bring the distances up to date with all frames so far."""
@@ -204,16 +152,19 @@ class Mapper(ShownMapper):
         """
         if not self._ready:
             raise NotReadyError("no surface was seen yet: call mapper.integrate(frame) first")
-        lattice = self.lattice
-        return LatticeField(
-            lattice.value.copy(),
-            lattice.confidence.copy(),
-            lattice.block.copy(),
-            lattice.corrections[: lattice.used].copy(),
+        lattice, nodes = self.lattice, self.lattice.nodes.arrays
+        snapshot = LatticeField(
+            lattice.table.copy(),
+            nodes["value"],
+            nodes["confidence"],
+            nodes["block"],
+            lattice.corrections,
             lattice.corner.copy(),
             lattice.spacing,
             self._bounds,
         )
+        lattice.readers.add(snapshot)
+        return snapshot
 
     def cost_field(self, eps: float) -> CostField:
         """The CHOMP collision cost c(f(x)) with reach `eps` [m], over a snapshot of the field."""
@@ -261,20 +212,24 @@ class Mapper(ShownMapper):
         """Where something stands in space known to be free; None if the frame is to be passed over."""
         if not self._ready:
             return np.zeros((-(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), dtype=bool)
-        appeared, contradicted, known = compare(
+        appeared, contradicted, judged = compare(
             self.lattice.arrays, self.bricks.arrays, depth, stride, _intrinsics(frame), T
         )
-        if known >= JUDGED and contradicted > CONTRADICTED and self._refused < PATIENCE:
-            self._refused += 1
-            self.frames_skipped += 1
-            logger.warning(
-                "at %.2f s %.0f %% of the depth image contradict the map: a jump of the pose? passed over",
-                frame.time,
-                100 * contradicted,
-            )
-            return None
-        self._refused = 0
-        return appeared
+        away = self._motion.away(Moment(depth, _intrinsics(frame), T, frame.time), stride)
+        complaint = ""
+        if judged > JUDGED and contradicted > CONTRADICTED:
+            complaint = f"{100 * contradicted:.0f} % of the depth image contradict the map"
+        elif away is not None:
+            complaint = f"the depth image fits the last one {100 * away:.0f} cm from its pose"
+        if not complaint:
+            self._refused = 0
+            return appeared
+        if self._refused >= PATIENCE:  # and on, until a frame agrees again
+            return appeared
+        self._refused += 1
+        self.frames_skipped += 1
+        logger.warning("at %.2f s %s: a jump of the pose? passed over", frame.time, complaint)
+        return None
 
     def _view(
         self, depth: Float[np.ndarray, "h w"], T: Float[np.ndarray, "4 4"], frame: DepthFrame
@@ -310,23 +265,23 @@ class Mapper(ShownMapper):
         inverse = np.linalg.inv(T)
         fuse(bricks.arrays, *bricks.box(*box), depth, *band, config.max_weight, intrinsics, inverse)
         begin, end = lattice.window(*box)
+        evidence = lattice.read("evidence", begin, end)
+        first, size = lattice.corner + begin, end - begin
         look_through(
-            lattice.evidence,
-            lattice.corner,
-            lattice.spacing,
-            begin,
-            end,
-            depth,
-            appeared,
-            stride,
-            intrinsics,
-            inverse,
-        )
+            evidence, first, lattice.spacing, 0 * size, size, depth, appeared, stride, intrinsics, inverse
+        )  # fmt: skip
+        lattice.write(begin, end, evidence=evidence)
 
     def _guess(self, eye: Float[np.ndarray, "3"]) -> None:
         box = guess(self.lattice, self.bricks, self.network, eye, self.up)
         if box is not None:
             self._touch(box)
+
+    def _keep_up(self, now: float) -> None:
+        """Refresh when it is due, whether the newest frame was believed or not."""
+        if not self._ready or not 0 < now - self._refreshed_at < self.config.refresh_period:
+            self.refresh()
+            self._refreshed_at = now
 
     def _touch(self, box: np.ndarray) -> None:
         """Have a box (2, 3) [m] refreshed with the next refresh."""

@@ -52,11 +52,10 @@ def guess(
     seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))
     if len(seeds) == 0 or (end <= begin).any():
         return None
-    part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
     # The network knows the vertical as the last axis, upwards.
     order = [axis for axis in range(3) if axis != vertical] + [vertical]
     evidence, corner, seeds = (
-        lattice.evidence[part].transpose(order),
+        lattice.read("evidence", begin, end).transpose(order),
         (lattice.corner + begin)[order],
         seeds[:, order],
     )
@@ -65,9 +64,11 @@ def guess(
         evidence, seeds = evidence[:, :, ::-1], seeds * np.array([1, 1, -1], dtype=np.float32)
         corner[2] = -(corner[2] + evidence.shape[2] - 1)
     proven = gather(np.ascontiguousarray(seeds), np.ascontiguousarray(evidence), corner, lattice.spacing)
-    for name, answer in zip(("share", "width"), _run(network, features(proven)), strict=True):
-        answer = answer[:, :, ::-1] if upside_down else answer
-        getattr(lattice, name)[part] = answer.transpose(np.argsort(order))
+    share, width = (
+        (answer[:, :, ::-1] if upside_down else answer).transpose(np.argsort(order))
+        for answer in _run(network, features(proven))
+    )
+    lattice.write(begin, end, share=share, width=width)
     return lattice.spacing * np.stack([lattice.corner + begin, lattice.corner + end - 1])
 
 
@@ -92,32 +93,29 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     places = (centre / np.float32(2 * bricks.voxel) - (lattice.corner + begin) * half).astype(np.float32)
     nearest, _ = nearest_points(places, (nx, ny, nz), 1)
     patches = Patches(centre, normal, weight, PATCH * bricks.voxel, nearest)
-    part = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
-    proven = gather(
-        centre, np.ascontiguousarray(lattice.evidence[part]), lattice.corner + begin, lattice.spacing
-    )
+    evidence = lattice.read("evidence", begin, end)
+    proven = gather(centre, evidence, lattice.corner + begin, lattice.spacing)
     window = Window(
         first=lattice.corner + begin,
         ratio=ratio,
-        evidence=np.ascontiguousarray(lattice.evidence[part]),
+        evidence=evidence,
         lower=proven.lower,
-        share=lattice.share[part].astype(np.float32),
-        width=lattice.width[part].astype(np.float32),
+        share=lattice.read("share", begin, end).astype(np.float32),
+        width=lattice.read("width", begin, end).astype(np.float32),
         value=np.empty(proven.lower.shape, dtype=np.float32),
         confidence=np.empty(proven.lower.shape, dtype=np.uint8),
         state=np.empty(proven.lower.shape, dtype=np.int8),
         taken=np.empty(proven.lower.shape, dtype=np.float32),
-        block=lattice.block[part].copy(),
+        block=lattice.read("block", begin, end),
     )
     coarse_values(window, patches, bricks.arrays)
-    lattice.value[part], lattice.confidence[part] = window.value, window.confidence
     refine, stale = np.zeros_like(window.block, dtype=np.bool_), np.zeros_like(window.block, dtype=np.bool_)
     cells_to_refine(window, patches, bricks.arrays, lattice.corrections, refine, stale)
     # The window's last nodes belong to cells that reach out of it: those stay as they are.
     inner = np.zeros_like(refine)
     inner[:-1, :-1, :-1] = True
-    fresh = lattice.reassign(window.block, refine & inner, ~refine & inner)
-    cells = np.argwhere(inner & (window.block >= 0) & (fresh | stale))
-    refined_values(window, patches, bricks.arrays, cells, lattice.corrections)
-    lattice.block[part] = window.block
+    written = inner & refine & ((window.block < 0) | stale)
+    lattice.reassign(window.block, written, inner & ~refine)
+    refined_values(window, patches, bricks.arrays, np.argwhere(written), lattice.corrections)
+    lattice.write(begin, end, value=window.value, confidence=window.confidence, block=window.block)
     return True

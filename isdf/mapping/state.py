@@ -14,13 +14,12 @@ from torch import Tensor
 
 from ..errors import CheckpointError
 from ..mapfile import consistent, read, write
-from .lattice import BLOCK
-from .mapper import Mapper, MapperConfig
+from .config import MapperConfig
+from .lattice import BLOCK, CHUNK, NODES
+from .mapper import Mapper
 
 FORMAT = "isdf-lattice-map"
-VERSION = 1
-# Arrays of the lattice that have one entry a node.
-NODES = ("value", "confidence", "block", "evidence", "share", "width")
+VERSION = 2
 
 
 def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
@@ -33,8 +32,12 @@ def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
     bounds = mapper.bounds
     mapper.refresh()
     bricks, lattice = mapper.bricks, mapper.lattice
-    arrays = {f"lattice.{name}": getattr(lattice, name) for name in NODES}
-    arrays["lattice.corrections"] = lattice.corrections[: lattice.used]
+    held = lattice.table >= 0
+    arrays = {f"lattice.{name}": lattice.nodes.arrays[name][lattice.table[held]] for name in NODES}
+    arrays["lattice.table"] = _numbered(lattice.table, held)
+    block = arrays["lattice.block"]
+    arrays["lattice.corrections"] = lattice.corrections[block[block >= 0]]
+    arrays["lattice.block"] = _numbered(block, block >= 0)
     arrays["bricks.table"] = bricks.table
     # Half precision: a hundredth of the noise that is left in them.
     arrays["bricks.distance"] = bricks.distance.astype(np.float16)
@@ -75,24 +78,18 @@ def _restored(tensors: dict[str, Tensor], header: dict[str, Any], device: str | 
     bricks.corner = np.array(header["bricks_corner"], dtype=np.int64).reshape(3)
     lattice.corner = np.array(header["lattice_corner"], dtype=np.int64).reshape(3)
     bricks.restore(arrays["bricks.table"], arrays["bricks.distance"], arrays["bricks.weight"])
-    for name in NODES:
-        values, empty = arrays[f"lattice.{name}"], getattr(lattice, name)
-        if values.dtype != empty.dtype or values.shape != arrays["lattice.value"].shape or values.ndim != 3:
+    nodes = {name: arrays[f"lattice.{name}"] for name in NODES}
+    lattice.table = arrays["lattice.table"]
+    corrections, rows = arrays["lattice.corrections"], len(nodes["value"])
+    for name, values in nodes.items():
+        if values.dtype != NODES[name][0] or values.shape != (rows, CHUNK**3):
             raise CheckpointError(f"{name} is {values.dtype} {values.shape}, which does not fit the lattice")
-        setattr(lattice, name, values)
-    corrections = arrays["lattice.corrections"]
-    if (
-        corrections.dtype != np.int8
-        or corrections.shape[1:] != (BLOCK,)
-        or lattice.block.max() >= len(corrections)
-    ):
-        raise CheckpointError(
-            f"corrections are {corrections.dtype} {corrections.shape}, which does not fit the cells"
-        )
-    lattice.corrections, lattice.used = corrections, len(corrections)
-    held = np.zeros(len(corrections), dtype=bool)
-    held[lattice.block[lattice.block >= 0]] = True
-    lattice.spare = np.flatnonzero(~held).tolist()
+    _check_numbers("chunks", lattice.table, 3, rows)
+    if corrections.dtype != np.int8 or corrections.shape[1:] != (BLOCK,):
+        raise CheckpointError(f"corrections are {corrections.dtype} {corrections.shape}, not those of cells")
+    _check_numbers("cells", nodes["block"], 2, len(corrections))
+    lattice.nodes.restore(nodes)
+    lattice.cells.restore({"corrections": corrections})
     mapper._bounds = tensors["bounds"].reshape(2, 3)
     mapper.up = np.array(header["up"], dtype=float).reshape(3)
     mapper.frames_seen, mapper.frames_skipped = int(header["frames_seen"]), int(header["frames_skipped"])
@@ -100,6 +97,22 @@ def _restored(tensors: dict[str, Tensor], header: dict[str, Any], device: str | 
     mapper._refreshed_at = float(header["refreshed_at"] if header["refreshed_at"] is not None else -math.inf)
     mapper._guessed_at = float(header["guessed_at"] if header["guessed_at"] is not None else -math.inf)
     return mapper
+
+
+def _numbered(rows: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """The same table for rows in the order in which the table names them."""
+    out = np.full(rows.shape, -1, dtype=np.int32)
+    out[held] = np.arange(held.sum())
+    return out
+
+
+def _check_numbers(what: str, table: np.ndarray, axes: int, rows: int) -> None:
+    """Refuse a table that does not name each of so many rows once: two would be written as one."""
+    named = np.sort(table[table >= 0])
+    if table.dtype != np.int32 or table.ndim != axes or not np.array_equal(named, np.arange(rows)):
+        raise CheckpointError(
+            f"the table of {what} is {table.dtype} {table.shape} and does not fit {rows} of them"
+        )
 
 
 def _finite(value: float) -> float | None:

@@ -20,6 +20,9 @@ LARGE_ERROR = 0.05
 # Odds that a well-seen seed is wrong by that much, how much greater they are for one hardly seen, and the weight
 # (in measurements at 1 m) that makes the difference; read off seeds of a simulated office.
 SEED_ODDS, FAINT_ODDS, FAINT_WEIGHT = 0.003, 0.15, 0.1
+# In space looked through, a guess that takes off less than this share of its own expected error takes off nothing: the
+# network's sigmoid never reaches zero, but there the median mostly is zero.
+LEAST_OF_ERROR = 0.5
 
 
 class Patches(NamedTuple):
@@ -94,7 +97,10 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
                     low = max(min(low, np.float32(0)), -upper)
                 gap = upper - low
                 error = gap * np.exp(window.width[i, j, k])
-                window.taken[i, j, k] = 2 * upper if sign < 0 else gap * window.share[i, j, k]
+                share = window.share[i, j, k]
+                if sign > 0 and share < LEAST_OF_ERROR * np.exp(window.width[i, j, k]):
+                    share = np.float32(0)
+                window.taken[i, j, k] = 2 * upper if sign < 0 else gap * share
                 window.value[i, j, k] = upper - window.taken[i, j, k]
                 window.state[i, j, k] = sign
                 faint = FAINT_WEIGHT / (patches.weight[seed] + FAINT_WEIGHT)

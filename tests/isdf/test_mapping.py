@@ -65,15 +65,15 @@ def test_it_is_exact_where_the_camera_looked_and_knows_where_that_was(orbit):
     seen = visible_points(furnished_orbit(16), 200)
     error = field.distance(seen) - sdf(seen)
     sure = field.confidence(seen) > 0.95
-    assert sure.float().mean() > 0.1
-    assert error[sure].abs().mean() < 0.04
-    assert error[sure].abs().mean() < 0.7 * error[~sure].abs().mean()
-    assert error.abs().mean() < 0.06
-    assert (error > 0.05).float().mean() < 0.06
+    assert sure.float().mean() > 0.12
+    assert error[sure].abs().mean() < 0.0055
+    assert error[sure].abs().mean() < 0.15 * error[~sure].abs().mean()
+    assert error.abs().mean() < 0.04
+    assert (error > 0.05).float().mean() < 0.038
     everywhere = torch.cat([seen, room_points()])
     everywhere = everywhere[sdf(everywhere) > 0]
-    assert roc_area(field.confidence(everywhere), field.distance(everywhere) - sdf(everywhere)) > 0.85
-    assert field.confidence(seen).mean() > 0.6
+    assert roc_area(field.confidence(everywhere), field.distance(everywhere) - sdf(everywhere)) > 0.89
+    assert field.confidence(seen).mean() > 0.63
     assert field.confidence(torch.tensor([[0.0, 0.0, 30.0]])) == 0
 
 
@@ -86,17 +86,18 @@ def test_guesses_beat_the_distance_to_what_was_seen():
     points = points[sdf(points) > 0]
     upper = torch.from_numpy(cKDTree(seeds).query(points.numpy())[0]).float()
     field = mapper.field()
-    assert (field.distance(points) - sdf(points)).abs().mean() < 0.5 * (upper - sdf(points)).abs().mean()
+    assert (field.distance(points) - sdf(points)).abs().mean() < 0.18 * (upper - sdf(points)).abs().mean()
 
 
 def test_truth_lies_between_the_bounds(orbit):
     lattice, bricks = orbit.lattice, orbit.bricks
     seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(np.full(3, -9.0), np.full(3, 9.0)))
-    proven = gather(seeds, lattice.evidence, lattice.corner, lattice.spacing)
+    evidence = lattice.read("evidence", np.zeros(3, dtype=int), np.array(lattice.shape))
+    proven = gather(seeds, evidence, lattice.corner, lattice.spacing)
     nodes = lattice.spacing * (lattice.corner + np.argwhere(np.ones(lattice.shape, dtype=bool)))
     inside = (np.abs(nodes) < [2.5, 2.0, 9]).all(axis=1) & (nodes[:, 2] > 0) & (nodes[:, 2] < 2.5)
     truth = furnished_room()(torch.from_numpy(nodes)).numpy()[inside]
-    assert (truth > proven.upper.ravel()[inside] + 0.05).mean() < 0.01
+    assert (truth > proven.upper.ravel()[inside] + 0.05).mean() < 0.007
     free = proven.free.ravel()[inside]
     assert free.any()
     assert (truth[free] < proven.lower.ravel()[inside][free] - 0.08).mean() < 0.02
@@ -108,7 +109,7 @@ def test_sweeps_find_the_nearest_points():
     nodes = np.argwhere(np.ones((20, 16, 12), dtype=bool))
     exact = cKDTree(points).query(nodes)[0]
     assert (np.sqrt(square).ravel() >= exact - 1e-4).all()
-    assert (np.sqrt(square).ravel() - exact).mean() < 0.01
+    assert (np.sqrt(square).ravel() - exact).mean() < 1e-6
 
 
 def test_gradient_is_that_of_the_interpolant(orbit):
@@ -144,7 +145,7 @@ def test_queries_of_any_shape_and_number_of_threads_agree(orbit):
 def test_a_baked_field_is_close_to_the_field(orbit):
     field, points = orbit.field(), visible_points(furnished_orbit(16), 50)
     baked = field.bake(0.04)
-    assert (baked.distance(points) - field.distance(points)).abs().mean() < 0.005
+    assert (baked.distance(points) - field.distance(points)).abs().mean() < 0.001
 
 
 def test_snapshots_do_not_change_and_saved_maps_go_on_alike(tmp_path):
@@ -195,7 +196,7 @@ def test_what_moves_goes_and_comes_within_two_seconds_of_being_looked_at():
     near = torch.tensor([0.08, -0.82, 0.5]) + 0.16 * (
         torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     )
-    assert (mapper.field().distance(near) - scene(obstacle)(near)).abs().mean() < 0.05
+    assert (mapper.field().distance(near) - scene(obstacle)(near)).abs().mean() < 0.036
     frame = render(scene(other), look_at((-1.6, -1.5, 1.3), (0.3, 0.2, 0.5)), CAMERA)
     rest = visible_points([frame], 2000)
     rest = rest[(scene(obstacle)(rest) - scene(other)(rest)).abs() < 1e-3]
@@ -207,8 +208,8 @@ def test_what_moves_goes_and_comes_within_two_seconds_of_being_looked_at():
     front = torch.tensor([-0.3, 0.5, 0.5]) + 0.1 * (
         torch.rand(200, 3, generator=torch.Generator().manual_seed(1)) - 0.5
     )
-    assert (field.distance(front) < 0).float().mean() > 0.8
-    assert (field.distance(rest) - truth(rest)).abs().mean() < 1.1 * before + 0.002
+    assert (field.distance(front) < 0).float().mean() > 0.95
+    assert (field.distance(rest) - truth(rest)).abs().mean() < 1.1 * before
 
 
 def test_a_jump_of_the_pose_is_passed_over_and_said_so(caplog):
@@ -281,7 +282,7 @@ def test_turned_worlds_give_the_same_map():
             mapper.integrate(DepthFrame(frame.depth, T, frame.camera, frame.time))
         mapper.refresh()
         fields.append(mapper.field().distance(points @ R.T))
-    assert (fields[0] - fields[1]).abs().mean() < 0.06
+    assert (fields[0] - fields[1]).abs().mean() < 0.006
     assert sdf(points).abs().mean() > 0.2
 
 

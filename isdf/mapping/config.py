@@ -1,0 +1,60 @@
+"""Settings of the default map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ..errors import ConfigError
+from ..numbers import require_finite
+
+# Four times the default limit; a brick takes four kilobytes, though most places never get one.
+MOST_BRICKS = 1 << 25
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """Settings of the default map.
+
+    Args:
+        voxel: edge of a fine voxel [m]; the coarse nodes lie four of them apart, and the network knows no other.
+        truncation: least truncation of the fused distances [m].
+        truncation_noise: truncation per squared depth [m / m^2]: it follows the noise of far depth.
+        max_depth: pixels measured farther than this are ignored [m].
+        max_weight: of a voxel, in measurements at 1 m: enough to average the noise.
+        refresh_period: least frame time between two refreshes of the distances [s].
+        guess_period: least frame time between two runs of the network [s].
+        max_bricks: a frame that needs a larger table of bricks (of eight voxels a side) is refused.
+    """
+
+    voxel: float = 0.04
+    truncation: float = 0.12
+    truncation_noise: float = 0.012
+    max_depth: float = 10.0
+    max_weight: float = 20.0
+    refresh_period: float = 0.3
+    guess_period: float = 1.0
+    max_bricks: int = 8_000_000
+
+    def __post_init__(self) -> None:
+        require_finite(
+            self,
+            (
+                "guess_period",
+                "refresh_period",
+            ),
+        )
+        for name in ("voxel", "truncation", "max_depth", "max_weight", "max_bricks"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if self.max_bricks > MOST_BRICKS:
+            raise ConfigError(
+                f"max_bricks must be at most {MOST_BRICKS}, got {self.max_bricks}: memory ends before"
+            )
+        if not self.truncation > 2 * self.voxel:
+            raise ConfigError(
+                f"truncation must be more than two voxels, got {self.truncation} m with a voxel of {self.voxel} m"
+            )
+        for name in ("refresh_period", "guess_period", "truncation_noise"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must be zero or more, got {getattr(self, name)}")
