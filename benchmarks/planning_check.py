@@ -19,6 +19,7 @@ TOLERANCE = 1e-3  # [m] of penetration
 STEP = 0.02  # [rad | m] between interpolated states, in the joint that moves most
 GOAL_POSITION, GOAL_ANGLE = 0.01, np.deg2rad(5.0)
 LIMIT_TOLERANCE = 1e-4  # [rad | m]; problems' own starts are rounded
+RATE_TOLERANCE = 1e-6  # relative, of velocities and accelerations
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Checker:
             info = self._bullet.getJointInfo(self._body, i)
             self._links[i] = info[12].decode()
             if info[2] != pybullet.JOINT_FIXED:
-                self._joints[info[1].decode()] = (i, info[8], info[9])
+                self._joints[info[1].decode()] = (i, info[8], info[9], info[11])
         shaped = [i for i in self._links if self._bullet.getCollisionShapeData(self._body, i)]
         shaped = [i for i in shaped if self._links[i] not in robot.ignored_links]
         self._shaped = shaped
@@ -87,10 +88,37 @@ class Checker:
                 return f"{name}: {fault}"
         return "ok"
 
+    def times_fault(
+        self,
+        problem: Mapping[str, Any],
+        waypoints: Sequence[Sequence[float]],
+        times: Sequence[float],
+        acceleration_time: float,
+    ) -> str:
+        """Empty, or what is wrong with the times of a path from rest to rest.
+
+        Velocities of the segments keep the URDF's limits; their differences over half the two segments' times keep the
+        acceleration that reaches these limits in `acceleration_time` [s].
+        """
+        path, at = np.asarray(waypoints, float), np.asarray(times, float)
+        if at.shape != (len(path),) or not np.isfinite(at).all() or (np.diff(at) <= 0).any() or len(at) < 2:
+            return "times malformed"
+        limits = np.array([self._joints[name][3] for name in problem["joints"]])
+        dt = np.diff(at)[:, None]
+        velocity = np.diff(path, axis=0) / dt
+        if (np.abs(velocity) > limits * (1 + RATE_TOLERANCE)).any():
+            return f"{problem['joints'][int((np.abs(velocity) / limits).max(0).argmax())]} too fast"
+        still = np.zeros((1, len(limits)))
+        between = np.concatenate([dt[:1], dt[:-1] + dt[1:], dt[-1:]]) / 2
+        acceleration = np.abs(np.diff(np.concatenate([still, velocity, still]), axis=0) / between)
+        if (acceleration > limits / acceleration_time * (1 + RATE_TOLERANCE)).any():
+            return f"{problem['joints'][int((acceleration / limits).max(0).argmax())]} accelerates too hard"
+        return ""
+
     def state_fault(self, problem: Mapping[str, Any], q: np.ndarray) -> str:
         """Empty, or what is wrong with a configuration."""
         for name, value in zip(problem["joints"], q, strict=True):
-            _, low, high = self._joints[name]
+            _, low, high, _ = self._joints[name]
             if low < high and not low - LIMIT_TOLERANCE <= value <= high + LIMIT_TOLERANCE:
                 return f"{name} beyond its limits"
         self._pose(problem, q)

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from planning.exact_shape import UNLIMITED, ExactShape
-from planning.initialise import NoPath, RrtConfig
+from planning.exact_shape import ExactShape
+from planning.initialise import WIDE_RANGE, NoPath, RrtConfig
 
 SAMPLES = 2000  # of the first attempt; each further one has twice as many
 MOST_SAMPLES = 100_000
@@ -115,8 +115,9 @@ def _with_end_margins(shape: ExactShape, ends: np.ndarray, config: RrtConfig):  
 
     depth, _, gap, _ = shape.measure(torch.from_numpy(ends), np.inf, np.inf)
     low, high = shape.world.low, shape.world.high
-    low = np.where(low <= -UNLIMITED, ends.min(0) - config.unlimited_range, low)
-    high = np.where(high >= UNLIMITED, ends.max(0) + config.unlimited_range, high)
+    wide = high - low > WIDE_RANGE
+    low = np.where(wide, np.maximum(low, ends.min(0) - config.unlimited_range), low)
+    high = np.where(wide, np.minimum(high, ends.max(0) + config.unlimited_range), high)
     world = shape.world._replace(low=low, high=high, margin=config.min_margin, self_margin=config.self_margin)
     usable = [free(world, q) for q in ends]
     keep = [float(depth[i]) for i in range(len(ends)) if usable[i]]

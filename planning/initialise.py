@@ -7,6 +7,7 @@ tests all edges in one query of the spheres, so that the field, and not Python, 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -23,6 +24,9 @@ from planning.workspace import Workspace, WorkspaceConfig
 logger = logging.getLogger(__name__)
 
 STATES_AT_ONCE = 2000
+WIDE_RANGE = (
+    4 * math.pi
+)  # [rad | m] of a joint above which all of it is no use to sample, as of a base in a hall
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,8 @@ class RrtConfig:
             connect.
         reach: longest edge of a round, as the motion [m] of the sphere that moves most.
         resolution: motion [m] of that sphere between two states tested on an edge.
-        unlimited_range: joints without limits are sampled this far [rad | m] beyond start and goal.
+        unlimited_range: joints without limits, or with very wide ones, are sampled this far [rad | m] beyond start
+            and goal.
         goal_bias: share of the samples that are the root of the other tree.
         shortcut_rounds: batches of random shortcuts tried on the path.
         max_nodes: nodes of both trees after which the search gives up.
@@ -139,8 +144,10 @@ class StateSpace:
         self.robot, self.config = robot, config
         self.workspace = Workspace(robot, sdf, eps=1.0, config=config.workspace)
         low, high = robot.joint_limits.to(start).unbind(dim=1)
-        self.low = torch.where(low.isinf(), torch.minimum(start, goal) - config.unlimited_range, low)
-        self.high = torch.where(high.isinf(), torch.maximum(start, goal) + config.unlimited_range, high)
+        wide = high - low > WIDE_RANGE
+        least, most = torch.minimum(start, goal), torch.maximum(start, goal)
+        self.low = torch.where(wide, torch.maximum(low, least - config.unlimited_range), low)
+        self.high = torch.where(wide, torch.minimum(high, most + config.unlimited_range), high)
         with torch.no_grad():
             ends = self.workspace.clearance(*robot.spheres(torch.stack([start, goal])))
         tightest = float(ends.min().nan_to_num(config.min_margin))

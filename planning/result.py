@@ -22,6 +22,7 @@ class Status(enum.Enum):
     SELF_COLLISION = "self-collision"
     JOINT_LIMITS = "joint limits"
     INVALID_FIELD = "invalid field"
+    UNKNOWN_SPACE = "unknown space"
     CONSTRAINT = "constraint violated"
     NO_PATH = "no path"
 

@@ -96,7 +96,7 @@ class Solver:
             waypoints (joint values in the problem's order, start and goal included), times and clearance. Without
             success, waypoints and times are those of the best trajectory found.
         """
-        robot = self._robot_for(problem)
+        robot = self.robot_for(problem)
         order = [robot.joint_names.index(name) for name in problem.joints]
         back = torch.tensor(order).argsort()
         field_ = problem.field
@@ -121,7 +121,8 @@ class Solver:
         velocity = robot.velocity_limits.to(trajectory.waypoints)
         return retime(trajectory, velocity, velocity / self.config.acceleration_time)
 
-    def _robot_for(self, problem: Problem) -> SphereRobot:
+    def robot_for(self, problem: Problem) -> SphereRobot:
+        """The robot with its unplanned joints where a problem has them; raises `ProblemError` if it does not fit."""
         missing = sorted(set(problem.joints) - set(self._robot.joint_names))
         if missing:
             raise ProblemError(

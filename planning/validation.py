@@ -32,7 +32,7 @@ class ValidationConfig:
         margin: clearance [m] from obstacles that every sphere must keep.
         self_margin: gap [m] that self-collision pairs must keep.
         limit_tolerance: excess over a joint limit [rad | m] taken for rounding.
-        workspace: rules for the floor and for unknown space (which does not fail the check).
+        workspace: rules for the floor and for unknown space, which fails the check only if it is forbidden.
     """
 
     max_step: float = 0.01
@@ -55,7 +55,7 @@ class Validation:
     """Verdict of the dense check.
 
     Args:
-        status: SUCCESS or the first failing of: field, limits, start, goal, obstacles, self-collision.
+        status: SUCCESS or the first failing of: field, limits, start, goal, obstacles, self-collision, unknown space.
         message: the reason in words.
         clearance: least f - r [m] over all states and spheres; NaN if the field is not finite somewhere.
         self_clearance: least gap [m] of the self-collision pairs; inf without any.
@@ -137,6 +137,10 @@ def check(
     j = int(worst_gap.argmin())
     if worst_gap[j] < config.self_margin:
         return report.verdict(Status.SELF_COLLISION, j, name(int(worst_pair[j, 0])), self_text(j))
+    if config.workspace.unknown_forbidden:
+        state, sphere = _first_unknown(robot, workspace, samples.states)
+        if state >= 0:
+            return report.verdict(Status.UNKNOWN_SPACE, state, name(sphere), "{link} is in unknown space")
     return report.verdict(
         Status.SUCCESS, i, name(int(worst_sphere[i])), f"clear by {float(worst_depth[i]):.3f} m"
     )
@@ -257,6 +261,19 @@ def free_states(
     """Which states keep the margins from obstacles and from the robot itself; NaN in the field is not free."""
     depth, _, gap, _ = _measure(robot, workspace, states, config)
     return (depth >= config.margin) & (gap >= config.self_margin)
+
+
+def _first_unknown(
+    robot: SphereRobot, workspace: Workspace, states: Float[Tensor, "m dof"]
+) -> tuple[int, int]:
+    """The first state with a sphere in unknown space, and that sphere; -1 where there is none."""
+    kinematics, chunk = kinematics_of(robot), 500
+    for first in range(0, len(states), chunk):
+        unknown = workspace.unknown(kinematics.centres(states[first : first + chunk]))
+        if unknown is not None and unknown.any():
+            state, sphere = unknown.nonzero()[0].tolist()
+            return first + state, sphere
+    return -1, -1
 
 
 def _limit_excess(robot: SphereRobot, states: Float[Tensor, "m dof"]) -> Float[Tensor, "m dof"]:

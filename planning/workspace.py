@@ -31,11 +31,13 @@ class WorkspaceConfig:
             floor z = 0 is what is nearest to it, and f increases upwards. Covers the error of a mapped floor.
         unknown_confidence: space of lower confidence counts as blocked in searches and has at least the cost
             c(0) of a surface, where the field offers confidence; None takes the field at its word.
+        unknown_forbidden: such space is not to be entered at any price: a trajectory through it fails the dense check.
         chunk: most points in one query of the field, to bound memory.
     """
 
     floor_tolerance: float = 0.10
     unknown_confidence: float | None = None
+    unknown_forbidden: bool = False
     chunk: int = 100_000
 
     def __post_init__(self) -> None:
@@ -43,6 +45,10 @@ class WorkspaceConfig:
             raise ConfigError(
                 f"WorkspaceConfig: floor_tolerance must be >= 0 m and chunk >= 1, "
                 f"got {self.floor_tolerance:g} and {self.chunk}."
+            )
+        if self.unknown_forbidden and self.unknown_confidence is None:
+            raise ConfigError(
+                "WorkspaceConfig: unknown_forbidden needs unknown_confidence, below which space counts as unknown."
             )
 
 

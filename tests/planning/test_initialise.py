@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -114,3 +116,17 @@ def test_joints_weigh_what_they_move():
 def test_mismatched_joints_are_refused():
     with pytest.raises(TrajectoryError, match="start has 3 joints, the robot has 2"):
         rrt_connect(Disc(), FAR, torch.zeros(3), torch.zeros(3))
+
+
+@pytest.mark.parametrize("limit", [math.inf, 500.0])
+def test_a_base_in_a_wide_hall_is_sampled_near_its_ends(limit):
+    start, goal = torch.tensor([1.0, 0.0]), torch.tensor([4.0, 0.5])
+    space = StateSpace(Disc(limit=limit), TRAP, start, goal, RrtConfig(unlimited_range=2.0))
+    assert space.low.tolist() == [-1.0, -2.0] and space.high.tolist() == [6.0, 2.5]
+    path = rrt_connect(Disc(limit=limit), TRAP, start, goal)
+    assert not isinstance(path, NoPath), path
+
+
+def test_narrow_limits_are_sampled_whole():
+    space = StateSpace(Disc(limit=3.0), FAR, torch.zeros(2), torch.zeros(2), RrtConfig(unlimited_range=1.0))
+    assert space.low.tolist() == [-3.0, -3.0] and space.high.tolist() == [3.0, 3.0]

@@ -66,3 +66,10 @@ def test_malformed_trajectories_are_refused(waypoints, times, offender):
 def test_resampling_one_waypoint_is_refused():
     with pytest.raises(TrajectoryError, match="one waypoint"):
         Trajectory(torch.zeros(1, 2), torch.zeros(1)).resampled(5)
+
+
+def test_waypoints_that_hardly_differ_share_a_time_and_the_last_one_stays():
+    path = torch.tensor([[0.0, 0.0], [1e-30, 0.0], [1.0, 0.0], [1.0, 1e-30]])
+    timed = Trajectory.through(path)
+    assert len(timed) == 2 and torch.equal(timed.waypoints[[0, -1]], path[[0, -1]])
+    assert len(Trajectory.through(path[:1].expand(3, 2))) == 1

@@ -3,7 +3,19 @@ import math
 import pytest
 import torch
 
-from planning import Status, Trajectory, TrajectoryError, ValidationConfig, check
+from planning import (
+    ChompConfig,
+    ConfigError,
+    Planner,
+    PlannerConfig,
+    RrtConfig,
+    Status,
+    Trajectory,
+    TrajectoryError,
+    ValidationConfig,
+    WorkspaceConfig,
+    check,
+)
 from planning.ends import check_ends
 from tests.planning.fields import Box, Confident, Cylinder, HingeCost, NanBeyond, Sphere
 from tests.planning.robots import Base, Disc, PlanarArm
@@ -119,3 +131,25 @@ def test_one_waypoint_and_float64():
 def test_mismatched_joints_are_refused():
     with pytest.raises(TrajectoryError, match="3 joints a waypoint, but the robot has 2: base_x, base_y"):
         check(Disc(), _line([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]), FAR)
+
+
+def test_unknown_space_is_dear_or_forbidden():
+    """The short way leads through what was never seen; a detour over known ground exists."""
+    field = Confident(Sphere((50.0, 0.0, 0.0), 1.0), 0.0)
+    field.confidence = lambda points: ((points[..., :2] - torch.tensor([1.0, 0.1])).norm(dim=-1) > 0.4).to(
+        points
+    )
+    line = _line([0.0, 0.0], [2.0, 0.0])
+    dear, never = WorkspaceConfig(unknown_confidence=0.5), WorkspaceConfig(0.1, 0.5, unknown_forbidden=True)
+    assert check(Disc(), line, field, ValidationConfig(workspace=dear)).success
+    verdict = check(Disc(), line, field, ValidationConfig(workspace=never))
+    assert verdict.status is Status.UNKNOWN_SPACE and "sphere 0 is in unknown space" in verdict.message
+    assert 0.6 < float(line.at(verdict.time)[0]) < 0.65  # where it begins
+    config = PlannerConfig(
+        chomp=ChompConfig(validation=ValidationConfig(workspace=never)), rrt=RrtConfig(workspace=never)
+    )
+    result = Planner(Disc(), config).plan(torch.zeros(2), torch.tensor([2.0, 0.0]), field)
+    assert result.success, result.message
+    assert check(Disc(), result.trajectory, field, ValidationConfig(workspace=never)).success
+    with pytest.raises(ConfigError, match="needs unknown_confidence"):
+        WorkspaceConfig(unknown_forbidden=True)
