@@ -75,6 +75,7 @@ class Row:
 def main(options: LargeSpaces) -> None:
     """Map all places; print a line each."""
     torch.set_num_threads(1)
+    options.out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.WARNING)
     rng = np.random.default_rng(options.seed)
     places = {"room": corridor(rng, 6.0), "corridor": corridor(rng, options.length)}
@@ -95,9 +96,8 @@ def main(options: LargeSpaces) -> None:
             f"the snapshot {np.mean([r.snapshot for r in half]):.2f} ms",
             flush=True,
         )
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "large_spaces.json").write_text(json.dumps([asdict(row) for row in rows], indent=1))
-    plot(options.out / "large_spaces.png", rows)
+        (options.out / "large_spaces.json").write_text(json.dumps([asdict(row) for row in rows], indent=1))
+        plot(options.out / "large_spaces.png", rows)
 
 
 def mapped(name: str, rays: RayCaster, spots: Float[np.ndarray, "n 3"]) -> list[Row]:
