@@ -67,7 +67,8 @@ def test_on_the_surface_the_gradient_is_the_normal():
 def test_triangles_that_face_inwards_make_a_room():
     shell = trimesh.creation.box((4.0, 3.0, 2.5))
     shell.invert()
-    field = MeshField([shell, BOX])
+    beyond = BOX.copy().apply_translation([6.0, 0.0, 0.0])  # nearer to the last point, but in the rock
+    field = MeshField([shell, BOX, beyond])
     points = torch.tensor([[1.6, 0.0, 0.0], [0.0, 0.0, 0.1], [5.0, 0.0, 0.0]], dtype=torch.float64)
     torch.testing.assert_close(
         field.distance(points), torch.tensor([0.4, -0.1, -3.0], dtype=torch.float64), rtol=0, atol=1e-9
