@@ -57,6 +57,13 @@ def test_through_the_door_and_round_the_table(tiago, ends, planned):
     assert float((driving & reaching).float().mean()) > 0.5
 
 
+def test_the_search_alone_finds_the_door(tiago, ends):
+    """Samples must be drawn near the ends, not all over the hundred metres that the base may travel."""
+    path = rrt_connect(tiago, FLAT, *ends, RrtConfig(seconds=10.0, candidates=1))
+    assert not isinstance(path, NoPath), path
+    assert check(tiago, Trajectory.through(path), FLAT).success
+
+
 def test_replanning_from_the_last_plan_is_quick_and_stays_near_it(tiago, ends, planned):
     _, last = planned
     quick = ChompConfig(eps=0.1, descent=DescentConfig(polish=10))
