@@ -9,12 +9,15 @@ import torch
 from planning import (
     ChompConfig,
     DescentConfig,
+    NoPath,
     Planner,
     PlannerConfig,
     PrimitiveField,
+    RrtConfig,
     Solid,
     Trajectory,
     check,
+    rrt_connect,
 )
 
 robots = pytest.importorskip("robots")
@@ -55,6 +58,13 @@ def test_through_the_door_and_round_the_table(tiago, ends, planned):
     # Base and arm move at the same time, not one after the other.
     driving, reaching = (q.diff(dim=0)[:, part].norm(dim=1) > 1e-3 for part in (slice(0, 2), slice(4, 11)))
     assert float((driving & reaching).float().mean()) > 0.5
+
+
+def test_the_search_alone_finds_the_door(tiago, ends):
+    """Samples must be drawn near the ends, not all over the hundred metres that the base may travel."""
+    path = rrt_connect(tiago, FLAT, *ends, RrtConfig(seconds=10.0, candidates=1))
+    assert not isinstance(path, NoPath), path
+    assert check(tiago, Trajectory.through(path), FLAT).success
 
 
 def test_replanning_from_the_last_plan_is_quick_and_stays_near_it(tiago, ends, planned):
