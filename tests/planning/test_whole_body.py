@@ -9,12 +9,15 @@ import torch
 from planning import (
     ChompConfig,
     DescentConfig,
+    NoPath,
     Planner,
     PlannerConfig,
     PrimitiveField,
+    RrtConfig,
     Solid,
     Trajectory,
     check,
+    rrt_connect,
 )
 
 robots = pytest.importorskip("robots")
