@@ -124,11 +124,25 @@ def _save_ablation(path: Path, results: Sequence[Result]) -> None:
     spread: dict[str, dict[str, float]] = {}
     for name in [*tables.sequences(results), "mean"]:
         for method in tables.methods(results):
-            mine = [r for r in results if r["method"] == method and name in (r["sequence"], "mean")]
+            mine = [r for r in results if r["method"] == method]
+            mine = (
+                _of_whole_seeds(mine, results)
+                if name == "mean"
+                else [r for r in mine if r["sequence"] == name]
+            )
             found = tables.spread(mine, tables.at_end("sdf_error"))
             groups.setdefault(name, {})[NAMES[method]] = 100 * found[0] if found else None
             spread.setdefault(name, {})[NAMES[method]] = 100 * found[1] if found else 0.0
     save_bars(path, groups, "SDF error at the end [cm]", spread)
+
+
+def _of_whole_seeds(mine: Sequence[Result], results: Sequence[Result]) -> list[Result]:
+    """Results of a method from the seeds that have every sequence: a mean of other ones could not be compared."""
+    every = set(tables.sequences(results))
+    done: dict[int, set[str]] = {}
+    for result in mine:
+        done.setdefault(result["seed"], set()).add(result["sequence"])
+    return [result for result in mine if done[result["seed"]] == every]
 
 
 def _curves(results: Sequence[Result]) -> dict:

@@ -242,6 +242,20 @@ def test_tables_average_over_sequences_and_spread_over_seeds() -> None:
     assert "| a | 2.00 ± 1.41 / - |" in tables.by_sequence(results)
 
 
+def test_bars_of_a_mean_are_of_seeds_that_have_every_sequence(tmp_path, monkeypatch) -> None:
+    def result(sequence: str, method: str, seed: int, error: float) -> dict:
+        moments = [{"visible": {"sdf_error": error}}]
+        return {"method": method, "sequence": sequence, "seed": seed, "over_time": moments}
+
+    drawn: dict = {}
+    monkeypatch.setattr(mapping_report, "save_bars", lambda path, groups, label, spread: drawn.update(groups))
+    whole = [result("a", "isdf batch", 0, 0.01), result("b", "isdf batch", 0, 0.03)]
+    part = [result("a", "isdf batch", 1, 0.50), result("a", "isdf ray", 0, 0.02)]
+    mapping_report._save_ablation(tmp_path / "bars.png", whole + part)
+    assert drawn["mean"] == {"batch": pytest.approx(2.0), "ray": None}
+    assert drawn["a"] == {"batch": pytest.approx(25.5), "ray": pytest.approx(2.0)}
+
+
 def test_the_report_draws_everything_and_publishes_between_marks(recorded, tmp_path, monkeypatch) -> None:
     methods = {"isdf": SMALL, "exact": ExactConfig(voxel=0.08)}
     monkeypatch.setattr(experiments, "METHODS", methods)
