@@ -166,11 +166,14 @@ def _furniture(
 
 def attempt(task: Task) -> None:
     """One episode; an error becomes its report."""
+    before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
         report = episode(task)
     except Exception as error:
         report = {"success": False, "error": f"{type(error).__name__}: {error}"}
+    finally:
+        logging.disable(before)
     Path(task.folder).mkdir(parents=True, exist_ok=True)
     write_json(Path(task.folder) / "report.json", {"task": _told(task), **report})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -185,6 +186,7 @@ def test_results_are_kept_and_errors_are_results(
     monkeypatch.setattr(closed_loop, "make_scene", lambda name, seed=0: hall())
     options = closed_loop.Options(out=tmp_path, scene="hall", episodes=3)
     closed_loop.main(options)
+    assert logging.root.manager.disable == logging.NOTSET, "other programs in this process still log"
     folders = sorted((tmp_path / "hall" / "default" / "none").iterdir())
     assert asked == [0, 1, 2] and [f.name for f in folders] == ["000", "001", "002"]
     (folders[2] / "report.json").unlink()
