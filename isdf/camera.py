@@ -13,6 +13,8 @@ from .errors import CameraError
 
 # Largest |x / z| of a ray, 89.9 degrees, and longest focal length in image sizes.
 STEEPEST, LONGEST = 600.0, 1e5
+# Pixels of a depth camera are about square; binning one axis makes them twice or four times as long as wide.
+LONGEST_PIXEL = 10.0
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,11 @@ class PinholeCamera:
             )
         if self.width < 1 or self.height < 1:
             raise CameraError(f"image size must be at least 1 x 1, got {self.width} x {self.height}")
+        if not 1 / LONGEST_PIXEL <= self.fx / self.fy <= LONGEST_PIXEL:
+            raise CameraError(
+                f"fx={self.fx} and fy={self.fy} are pixels {max(self.fx / self.fy, self.fy / self.fx):.3g} times as "
+                f"long as wide, at most {LONGEST_PIXEL:g} is a camera's; check the intrinsics"
+            )
         for name, focal, centre, size in (
             ("x", self.fx, self.cx, self.width),
             ("y", self.fy, self.cy, self.height),

@@ -102,3 +102,11 @@ def test_places_and_times_that_numbers_cannot_hold_are_refused() -> None:
     for time in (math.nan, math.inf):
         with pytest.raises(FrameError, match="time"):
             DepthFrame(image(), np.eye(4), CAMERA, time)
+
+
+@pytest.mark.parametrize(("fx", "fy"), [(0.4, 21.0), (21.0, 0.4)])
+def test_a_camera_of_slivers_for_pixels_is_refused(fx, fy) -> None:
+    """One wrong digit in the intrinsics would make a map of a house out of a view of a table."""
+    with pytest.raises(CameraError, match="times as long as wide"):
+        PinholeCamera(fx, fy, 7.5, 5.0, 16, 12)
+    PinholeCamera(21.0, 10.5, 7.5, 5.0, 16, 12)  # binned along one axis
