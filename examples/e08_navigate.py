@@ -15,9 +15,8 @@ import tyro
 from tqdm import tqdm
 
 import isdf
-from examples.episode import ROBOT_HEIGHT, Episode, EpisodeOptions
+from examples.episode import Episode, EpisodeOptions
 from planning.drive import DriveReport
-from planning.protocols import DistanceField
 from planning.replanning import ReplanningConfig, ReplanningLoop
 
 
@@ -32,17 +31,10 @@ class Drive(EpisodeOptions):
 def main(options: Drive) -> DriveReport:
     """Drive; returns what happened."""
     torch.set_num_threads(1)
-    episode, mapper = Episode(options), isdf.Mapper()
+    episode = Episode(options)
     if episode.scene.goal is None:
         raise SystemExit(f"{options.scene} has no goal of its own; `examples.navigate` takes --goal X Y")
     goal = np.array(episode.scene.goal[:2])
-
-    def field_for_driving() -> DistanceField:
-        """The newest map up to the robot's height, on a grid: a base asks it at many thousand places a plan."""
-        bounds = mapper.bounds
-        bounds[0, 2], bounds[1, 2] = 0.0, ROBOT_HEIGHT
-        return mapper.field().bake(0.08, bounds, padding=0.1)
-
     with tqdm(desc="driving", unit=" rounds", disable=None) as bar:
 
         def watch(_: ReplanningLoop) -> None:
@@ -53,21 +45,22 @@ def main(options: Drive) -> DriveReport:
         loop = ReplanningLoop(
             episode.robot,  # senses and drives
             episode.body,  # its spheres at every heading
-            mapper,  # learns from the frames
-            field_for_driving,  # what is planned in
+            episode.mapper,  # learns from the frames
+            episode.field_for_driving,  # what is planned in
             ReplanningConfig(time_limit=options.time_limit),
             options.clock(),  # what computing costs the robot in time
             watch,
+            monitor=episode.monitor,  # has the last word on every command
         )
         report = loop.drive_to(goal)
     print(
         f"{report.status.value}: {report.path_length:.1f} m in {report.duration:.0f} s, {report.plans} plans"
     )
-    print(f"contacts: {episode.contacts() or 'none'}; {mapper}")
+    print(f"contacts: {episode.contacts() or 'none'}; {episode.mapper}")
 
     options.out.mkdir(parents=True, exist_ok=True)
     episode.robot.recording.save(options.out / "states.npz")
-    figure = mapper.field().plot_slice(0.5)
+    figure = isdf.plot_slice(episode.mapper.field(), 0.5, bounds=episode.mapper.bounds)
     driven = episode.robot.recording.base_poses()
     axes = figure.axes[0]
     axes.plot(driven[:, 0], driven[:, 1], color="red")
