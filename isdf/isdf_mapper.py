@@ -170,6 +170,8 @@ class IsdfMapper(ShownMapper):
             )
         first = self._network is None
         self._judge_newest()
+        if not first and self._newest is self.keyframes.frames[-1]:
+            self._frozen = copy.deepcopy(self._network)  # with all that the keyframe taught it
         self._bounds = grown(self._bounds, frame, reach)
         if first:
             self._begin(frame)
@@ -181,8 +183,6 @@ class IsdfMapper(ShownMapper):
         if steps > 0 and not first and self._judge_newest():
             for _ in range(self.config.keyframe_steps):
                 self.step()
-        if first:
-            self._frozen = copy.deepcopy(self._network)
 
     def step(self) -> float:
         """One optimisation step on the newest frame, the last keyframe and replayed ones; returns the mean loss.
@@ -190,13 +190,13 @@ class IsdfMapper(ShownMapper):
         Raises:
             DivergedError: the loss is NaN or infinite; the network is as it was before the call.
         """
-        frames, replayed = self._select()
+        frames, keyframes = self._select()
         batch = sample_rays(frames, self.config.sampling, self.generator)
         bound, target = supervise(batch, self.config.bound)
         distance, gradient = self.network.distance_and_gradient(batch.points.reshape(-1, 3))
         distance, gradient = distance.view(bound.shape), gradient.view(target.shape)
         if self.config.losses.noise > 0:
-            distance = distance + self._training_noise(batch)
+            distance = distance + self._training_noise(distance)
         loss = total_loss(distance, gradient, bound, target, batch.behind, self.config.losses)
         mean = float(loss.detach().mean())
         if not math.isfinite(mean):
@@ -209,7 +209,7 @@ class IsdfMapper(ShownMapper):
         loss.mean().backward()
         self._optimiser.step()
         self.steps += 1
-        self._record(loss.detach().mean(dim=1), batch, [len(self.keyframes) - 1, *replayed], len(frames))
+        self._record(loss.detach().mean(dim=1), batch, keyframes, len(frames))
         return mean
 
     def run_for(self, cpu_seconds: float) -> int:
@@ -266,25 +266,27 @@ class IsdfMapper(ShownMapper):
             if share >= config.explained_below:
                 return False
         self.keyframes.add(frame)
-        self._frozen = copy.deepcopy(self.network)
         return True
 
     def _select(self) -> tuple[list[DepthFrame], list[int]]:
-        """The window of this step: replayed keyframes' indices, and all frames with the newest first."""
+        """The frames of this step: the newest, the last keyframe besides it, and replayed ones; and their indices.
+
+        Indices are those of keyframes; the newest frame has one, the first, when it became a keyframe.
+        """
         if self._newest is None:
             raise NotReadyError("there is nothing to train on: call mapper.integrate(frame) first")
-        replayed = self.keyframes.draw(self.config.keyframes.replayed, self.generator)
-        last = self.keyframes.frames[-1]
-        frames = [last] if self._newest is last else [self._newest, last]
-        frames += [self.keyframes.frames[i] for i in replayed]
-        return frames, replayed
+        kept = self.keyframes.frames
+        own = [len(kept) - 1] if self._newest is kept[-1] else []
+        last = len(kept) - 1 - len(own)
+        others = [last, *self.keyframes.draw(self.config.keyframes.replayed, last, self.generator)]
+        others = others if last >= 0 else []
+        return [self._newest, *(kept[i] for i in others)], own + others
 
-    def _training_noise(self, batch: RayBatch) -> Tensor:
-        """Noise on the predicted distance [m], twice as strong on keyframes as on the newest frame, the first."""
-        scale = self.config.losses.noise * self.config.network.output_scale
-        by_ray = torch.where(batch.frame == 0, scale, 2 * scale)
-        noise = torch.randn(batch.along.shape, generator=self.generator).to(batch.along)
-        return noise * by_ray[:, None]
+    def _training_noise(self, distance: Tensor) -> Tensor:
+        """Noise on the predicted distance [m], twice as strong in the further steps on a new keyframe."""
+        further = len(self.keyframes) > 1 and self._newest is self.keyframes.frames[-1]
+        scale = self.config.losses.noise * self.config.network.output_scale * (2 if further else 1)
+        return scale * torch.randn(distance.shape, generator=self.generator).to(distance)
 
     def _record(self, ray_loss: Tensor, batch: RayBatch, keyframes: list[int], frames: int) -> None:
         """Update the running loss of the keyframes of this step: the last ones of its window."""

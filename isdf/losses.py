@@ -25,9 +25,9 @@ class LossConfig:
         eikonal_from: a [m], the eikonal loss applies from this distance on.
         free_space_beta: beta of the exponential for negative predictions in free space [1/m].
         regions_by: what t and a are compared with: "ray", the distance along the ray as in the paper's text, or
-            "bound", the bound itself as in its released code.
-        noise: standard deviation [raw output] of the noise added to the predicted distance of the newest frame
-            and (twice as much) of keyframes; 0 in the text, 0.04 in the released code.
+            "bound", the bound itself as in its released code: negative, so always near, behind a surface.
+        noise: standard deviation [raw output] of the noise added to predicted distances, twice as much while a
+            new keyframe gets its further steps; 0 in the text, 0.04 in the released code.
     """
 
     truncation: float = 0.30
@@ -98,7 +98,7 @@ def total_loss(
         ray_distance: D - d, measured along the ray [m].
         config: weights and regions.
     """
-    region = (ray_distance if config.regions_by == "ray" else bound).abs()
+    region = ray_distance.abs() if config.regions_by == "ray" else bound
     near = config.surface_weight * near_surface_loss(distance, bound)
     free = free_space_loss(distance, bound, config.free_space_beta)
     loss = torch.where(region <= config.truncation, near, free)

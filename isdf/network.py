@@ -124,7 +124,8 @@ class SDFNetwork(nn.Module):
         self.layers = nn.ModuleList(layers)
         for linear in layers:
             nn.init.xavier_normal_(linear.weight, generator=generator)
-            nn.init.zeros_(linear.bias)
+            spread = linear.in_features**-0.5
+            nn.init.uniform_(linear.bias, -spread, spread, generator=generator)
 
     @property
     def embedding_size(self) -> int:

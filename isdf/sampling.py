@@ -24,7 +24,7 @@ class SamplingConfig:
     Args:
         rays_per_frame: random pixels of each selected frame that are trained on.
         stratified: N, samples spread over [min_depth, D + behind] a ray.
-        near_surface: M, samples drawn from N(D, surface_sigma^2) a ray.
+        near_surface: M, samples drawn from N(D, surface_sigma^2) a ray, kept within the stratified ones' range.
         min_depth: d_min [m].
         behind: delta, how far beyond the surface the stratified samples reach [m].
         surface_sigma: sigma_s of the samples near the surface [m].
@@ -97,7 +97,7 @@ def sample_rays(frames: Sequence[DepthFrame], config: SamplingConfig, generator:
         extras.append(_surface_points(frame, pixels[config.rays_per_frame :]))
         rays.append(_rays_of(frame, pixels[: config.rays_per_frame], config.normal_step, index))
     depth, direction, normal, position, owner = (torch.cat(parts) for parts in zip(*rays, strict=True))
-    z = _depths_along(depth, config, generator)
+    z = depths_along(depth, config, generator)
     # `direction` has z = 1 in the camera frame, so z-depth times it is the point and its norm turns depth to length.
     stretch = direction.norm(dim=-1)
     points = position[:, None] + z[..., None] * direction[:, None]
@@ -181,8 +181,10 @@ def _surface_points(frame: DepthFrame, pixels: Tensor) -> Tensor:
     return (frame.camera.rays(pixels) * depth[:, None]) @ T[:3, :3].T + T[:3, 3]
 
 
-def _depths_along(depth: Tensor, config: SamplingConfig, generator: torch.Generator) -> Tensor:
-    """(r, 1 + M + N) z-depths [m]: the surface, Gaussian samples around it, stratified samples before it."""
+def depths_along(
+    depth: Float[Tensor, "r"], config: SamplingConfig, generator: torch.Generator
+) -> Float[Tensor, "r k"]:
+    """z-depths [m] of k = 1 + M + N samples: the surface, Gaussian ones around it, stratified ones before it."""
     rays = len(depth)
     edges = torch.linspace(0, 1, config.stratified + 1)[:-1]
     jitter = torch.rand(rays, config.stratified, generator=generator) / config.stratified
@@ -192,5 +194,6 @@ def _depths_along(depth: Tensor, config: SamplingConfig, generator: torch.Genera
     near = torch.minimum(torch.full_like(far, config.min_depth), depth[:, None] / 2)
     stratified = near + share * (far - near)
     noise = torch.randn(rays, config.near_surface, generator=generator).to(depth.device)
-    gaussian = (depth[:, None] + noise * config.surface_sigma).clamp(min=1e-3)
+    # Kept within the range, as the original does: what is farther behind a surface may well be free again.
+    gaussian = (depth[:, None] + noise * config.surface_sigma).clamp(near, far)
     return torch.cat([depth[:, None], gaussian, stratified], dim=1)

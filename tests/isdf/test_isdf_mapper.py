@@ -126,38 +126,76 @@ def test_information_gain_compares_with_the_frozen_copy_not_the_live_network() -
     mapper = IsdfMapper(replace(SMALL, first_frame_steps=150))
     frame = furnished_orbit(12)[0]
     mapper.integrate(frame)
+    mapper.integrate(replace_time(frame, 0.1))
     share = explained_share(mapper._frozen, frame, KeyframeConfig(), SamplingConfig(), torch.Generator())
     assert share > 0.65
     with torch.no_grad():
         mapper.network.layers[-1].bias += 10.0  # the live network now explains nothing
-    mapper.integrate(frame)
+    mapper.integrate(replace_time(frame, 0.2))
     assert len(mapper.keyframes) == 1
+
+
+def test_the_frozen_copy_knows_all_that_the_keyframe_taught() -> None:
+    frames = furnished_orbit(12)
+    mapper = IsdfMapper(replace(SMALL, first_frame_steps=20, steps_per_frame=2, keyframe_steps=15))
+
+    def frozen_is_live() -> bool:
+        pairs = zip(mapper._frozen.parameters(), mapper.network.parameters(), strict=True)
+        return all(torch.equal(a, b) for a, b in pairs)
+
+    mapper.integrate(frames[0])
+    mapper.integrate(frames[6])  # the opposite view: a keyframe, whose further steps come after it is judged
+    assert len(mapper.keyframes) == 2 and mapper.steps == 37 and not frozen_is_live()
+    mapper.config = replace(mapper.config, steps_per_frame=0)
+    mapper.integrate(frames[6])
+    assert frozen_is_live()
+
+
+def test_noise_doubles_while_a_keyframe_gets_its_further_steps() -> None:
+    frames = furnished_orbit(12)
+    mapper = IsdfMapper(replace(SMALL, losses=LossConfig(noise=0.04), first_frame_steps=1))
+    zero = torch.zeros(40_000)
+    mapper.integrate(frames[0])
+    first = float(mapper._training_noise(zero).std())
+    mapper.integrate(frames[6])
+    assert len(mapper.keyframes) == 2
+    assert first == pytest.approx(0.04 * 0.14, rel=0.03)
+    assert float(mapper._training_noise(zero).std()) == pytest.approx(2 * first, rel=0.05)
 
 
 def test_rendered_depth_is_where_the_field_crosses_zero() -> None:
     plane = lambda p: 2.0 - p[:, 2]  # noqa: E731
     direction = torch.tensor([[0.0, 0.0, 1.0], [0.3, 0.0, 1.0], [0.0, 1.0, 0.1]])
-    depth = torch.tensor([2.0, 2.2, 1.0])
-    rendered = render_depth(plane, depth, direction, torch.zeros(3), 20)
+    z = torch.linspace(0.05, 1.2, 20) * torch.tensor([[2.0], [2.2], [1.0]])
+    rendered = render_depth(plane, z, direction, torch.zeros(3))
     torch.testing.assert_close(rendered, torch.tensor([2.0, 2.0, torch.inf]))
 
 
 def test_replay_prefers_keyframes_with_high_loss_and_never_repeats() -> None:
     keyframes = KeyframeSet(list(furnished_orbit(12)[:6]), [1e-3, 1e-3, 5.0, 1e-3, 5.0, 100.0])
     generator = torch.Generator().manual_seed(0)
-    drawn = [keyframes.draw(3, generator) for _ in range(200)]
+    drawn = [keyframes.draw(3, 5, generator) for _ in range(200)]
     assert all(len(set(d)) == 3 and 5 not in d for d in drawn)  # the last one is in every window anyway
     assert sum({2, 4} <= set(d) for d in drawn) > 190
-    assert KeyframeSet(keyframes.frames[:1], [1.0]).draw(3, generator) == []
+    assert KeyframeSet(keyframes.frames[:1], [1.0]).draw(3, 0, generator) == []
 
 
-def test_the_window_is_newest_last_keyframe_and_replayed() -> None:
-    mapper = mapped()
-    frames, replayed = mapper._select()
-    assert frames[0] is mapper._newest or mapper._newest is mapper.keyframes.frames[-1]
-    assert mapper.keyframes.frames[-1] in frames
-    assert len(frames) <= 5 and len({id(f) for f in frames}) == len(frames)
-    assert len(replayed) == min(3, len(mapper.keyframes) - 1)
+@pytest.mark.parametrize("kept", [1, 2, 4, 8])
+def test_the_window_is_newest_last_keyframe_and_replayed(kept) -> None:
+    frames = list(furnished_orbit(12))
+    mapper = IsdfMapper(replace(SMALL, first_frame_steps=0, steps_per_frame=0))
+    mapper.integrate(frames[0])
+    mapper.keyframes = KeyframeSet(frames[:kept], [1.0] * kept)
+    for newest in (frames[11], frames[kept - 1]):  # passing by, and itself the last keyframe
+        mapper._newest = newest
+        window, indices = mapper._select()
+        before = kept - (newest is frames[kept - 1])
+        assert window[0] is newest and len(window) == 1 + min(4, before)
+        if before:
+            assert window[1] is frames[before - 1]
+        assert len({id(f) for f in window}) == len(window)
+        assert [id(frames[i]) for i in indices] == [id(f) for f in window[len(window) - len(indices) :]]
+        assert len(indices) == len(window) - (newest is frames[11])
 
 
 @pytest.mark.parametrize("bound", ["ray", "normal", "batch"])

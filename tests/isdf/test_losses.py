@@ -57,6 +57,13 @@ def test_total_loss_applies_each_term_in_its_region(regions_by) -> None:
     torch.testing.assert_close(total, expected)
 
 
+def test_a_negative_bound_is_near_the_surface_however_deep() -> None:
+    config = LossConfig(regions_by="bound")
+    f, gradient = torch.tensor([-0.1]), torch.tensor([[0.0, 0.0, 2.0]])
+    total = total_loss(f, gradient, torch.tensor([-0.5]), gradient, torch.tensor([-0.5]), config)
+    torch.testing.assert_close(total, config.surface_weight * torch.tensor([0.4]))
+
+
 def test_the_true_field_has_no_loss() -> None:
     p = torch.rand(100, 3) * 2
     normal = torch.tensor([0.0, 0.0, 1.0]).expand(100, 3)
