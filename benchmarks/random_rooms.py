@@ -147,7 +147,7 @@ def piece(rng: np.random.Generator, name: str) -> tuple[fn.Parts, float, float, 
     return (box,), w, u, tall
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def solid_distance(kind, p, x, y, z):
     """Signed distance of one solid at a point in its own frame."""
@@ -161,7 +161,7 @@ def solid_distance(kind, p, x, y, z):
     return np.sqrt(x * x + y * y + z * z) - p[0]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def scene_distance(kinds, rotation, centre, parameters, points):
     """Signed distance (n,) to the union of all solids at points (n, 3)."""
@@ -177,7 +177,7 @@ def scene_distance(kinds, rotation, centre, parameters, points):
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def depth_image(kinds, rotation, centre, parameters, T, intrinsics, height, width, near, far):
     """z-depth image (height, width) by sphere tracing; 0 where nothing lies between near and far [m]."""

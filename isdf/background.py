@@ -77,8 +77,8 @@ class BackgroundMapper:
     `snapshot` give what was last published, without waiting for the mapper: from any number of threads, as often as
     wanted. A snapshot is made by the mapping thread between two steps, so none is torn, and is never changed.
 
-    Torch and numpy let other threads run while they compute, so mapping and planning share the cores and not the
-    interpreter, but for their own Python code.
+    Compiled kernels, torch and numpy let other threads run while they compute, so mapping and planning share the cores
+    and not the interpreter, but for their own Python code.
 
     Args:
         mapper: of any method; from now on only this object may touch it.

@@ -175,8 +175,8 @@ def test_importing_isdf_is_quick_and_compiles_nothing() -> None:
     assert untouched == "True", "drawing in a notebook leaves its backend alone"
 
 
-def uncached(tree: ast.AST) -> list[int]:
-    """Lines of numba decorators that compile on import or do not keep their code on the disk for the next run."""
+def careless(tree: ast.AST) -> list[int]:
+    """Lines of numba decorators that compile on import, do not keep their code on the disk, or stop other threads."""
     bad = []
     for node in ast.walk(tree):
         for decorator in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
@@ -184,17 +184,20 @@ def uncached(tree: ast.AST) -> list[int]:
             if ast.unparse(called).split(".")[-1] not in ("njit", "jit", "vectorize", "guvectorize"):
                 continue
             keywords = {k.arg: ast.unparse(k.value) for k in getattr(decorator, "keywords", [])}
-            if keywords.get("cache") != "True" or getattr(decorator, "args", []):
+            kept, free = keywords.get("cache") == "True", keywords.get("nogil") == "True"
+            if not (kept and free) or getattr(decorator, "args", []):
                 bad.append(decorator.lineno)
     return bad
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_compiled_code_is_kept_between_runs(package: str) -> None:
-    found = {n: uncached(ast.parse(path.read_text())) for n, path in sources(ROOT, package).items()}
+def test_compiled_code_is_kept_between_runs_and_lets_other_threads_run(package: str) -> None:
+    found = {n: careless(ast.parse(path.read_text())) for n, path in sources(ROOT, package).items()}
     assert not {name: lines for name, lines in found.items() if lines}
-    text = "@njit\ndef a(): pass\n@njit(cache=True)\ndef b(): pass\n@nb.njit('f8(f8)', cache=True)\ndef c(): pass\n"
-    assert uncached(ast.parse(text)) == [1, 5]
+    good = "cache=True, nogil=True"
+    decorators = ("njit", f"njit({good})", f"nb.njit('f8(f8)', {good})", "njit(cache=True)")
+    text = "".join(f"@{one}\ndef f(): pass\n" for one in decorators)
+    assert careless(ast.parse(text)) == [1, 5, 7]
 
 
 def test_the_checks_see_what_they_look_for(tmp_path) -> None:

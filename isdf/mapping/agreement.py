@@ -19,7 +19,7 @@ SURE = 150
 BACK = 8
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def compare(lattice: LatticeArrays, bricks: Bricks, depth, stride, intrinsics, T_world_camera):
     """Look up every `stride`-th measured point, and the end of the way to it that ought to be free, in the map.

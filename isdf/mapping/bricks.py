@@ -148,7 +148,7 @@ def moved(
     return new
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[np.float32, np.float32]:
     """Distance [m] and weight of the voxel at a lattice index; 0 and 0 where nothing is stored."""
@@ -163,7 +163,7 @@ def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[np.float32, np.flo
     return bricks.distance[brick, at], bricks.weight[brick, at]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def missing_bricks(bricks: Bricks, depth, stride, noise, least, intrinsics, T_world_camera):
     """Array indices (n, 3) of the bricks that surfaces of a depth image need and the table lacks.

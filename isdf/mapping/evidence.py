@@ -28,7 +28,7 @@ BAND = 0.12
 INSIDE = 0.6
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def look_through(free, corner, spacing, begin, end, depth, appeared, stride, intrinsics, T_camera_world):
     """Mark the nodes of a box that a depth image looks through.
@@ -145,7 +145,7 @@ def _lower(free: np.ndarray, unknown: np.ndarray, upper: np.ndarray) -> np.ndarr
     return np.minimum(lower, upper)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _beside(these, those):
     """Which of these nodes have one of those among their 26 neighbours."""

@@ -176,7 +176,7 @@ def _confidence(points, origin, spacing, table, confidence, out):
         out[n] = total / 255
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def query_one(lattice: LatticeArrays, point):
     """Distance [m] at a point (3,) by the coarse nodes; confidence (0 .. 255) and looked through of the closest."""

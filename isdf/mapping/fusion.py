@@ -19,7 +19,7 @@ NOISE_FLOOR_DEPTH = 0.5
 TRUST = 8.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def fuse(bricks: Bricks, begin, end, depth, noise, least, max_weight, intrinsics, T_camera_world):
     """Average one depth image into the stored voxels of a box of bricks, in place.

@@ -197,7 +197,7 @@ def node_at(table, values, i, j, k, empty):
     return values[row, ((i & 7) << 6) | ((j & 7) << 3) | (k & 7)]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _copy(table, values, begin, window, into):
     """Copy the window that begins at a node from the chunks, or into them; where there is no chunk nothing happens."""

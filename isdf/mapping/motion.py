@@ -105,7 +105,7 @@ def _close(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
     return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < NEAR and np.arccos(np.clip(cosine, -1, 1)) < TURNED)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def differing(depth, stride, intrinsics, other, other_intrinsics, T_other_camera):
     """Count the points of a depth image that another one shows at another depth.

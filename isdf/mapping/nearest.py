@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def nearest_points(
     points: Float[np.ndarray, "n 3"], shape: tuple[int, int, int], rounds: int
@@ -50,7 +50,7 @@ def nearest_points(
     return best, square
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _sweep(points, best, square, direction):
     """One raster pass: each node tries the points of the 13 neighbours that were passed before it."""

@@ -10,7 +10,7 @@ from numba import njit
 from .bricks import Bricks, voxel_at
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def surface_seeds(bricks: Bricks, begin, end):
     """Zero crossings between observed neighbours, averaged within each voxel, of a box of bricks.

@@ -73,7 +73,7 @@ class Window(NamedTuple):
     block: np.ndarray
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
     """Write value, confidence, state and what was taken off of every node of a window."""
@@ -112,7 +112,7 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
                 window.confidence[i, j, k] = int(255 * chance + 0.5)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def cells_to_refine(window: Window, patches: Patches, bricks: Bricks, corrections, refine, stale):
     """Find the cells in which trilinear interpolation misses the middle of an edge, of a face or of the cell.
@@ -149,7 +149,7 @@ def cells_to_refine(window: Window, patches: Patches, bricks: Bricks, correction
                         break
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corrections):
     """Write the corrections of cells (n, 3): what interpolation of the corners misses at each of their fine nodes."""
@@ -165,7 +165,7 @@ def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corr
                     corrections[window.block[i, j, k], (a * FINE + b) * FINE + c] = int(np.floor(steps + 0.5))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _fine_value(window, patches, bricks, i, j, k, a, b, c, plain):
     """Distance [m] of the fine node (a, b, c) steps into the cell above node (i, j, k) of the window."""
@@ -194,7 +194,7 @@ def _fine_value(window, patches, bricks, i, j, k, a, b, c, plain):
     return upper - min(2 * upper, taken_other / other if other > 0 else taken_free / free)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _sign(window, bricks, at, side):
     """Side of the seen surfaces a fine node lies on by the fused distances: 1, -1, or 0 where none was fused."""
@@ -210,7 +210,7 @@ def _sign(window, bricks, at, side):
     return 1 if (distance if abs(distance) > 0.5 * bricks.voxel else side) >= 0 else -1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _nearest_patch(window, patches, voxel, at):
     """Distance [m] of a fine node to the closest of the patches that are nearest around it, height above it, number."""
@@ -237,7 +237,7 @@ def _nearest_patch(window, patches, voxel, at):
     return np.sqrt(best), side, number
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _corners(window, i, j, k):
     """Of a cell: whether all corners are free with nothing taken off, how much is at most [m], is any state known."""
@@ -253,14 +253,14 @@ def _corners(window, i, j, k):
     return plain, most, known
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _corner_weight(p, q, r, a, b, c, ratio):
     """Weight of corner (p, q, r) of a cell in trilinear interpolation (a, b, c) fine steps into it."""
     return (a if p else ratio - a) * (b if q else ratio - b) * (c if r else ratio - c) / ratio**3
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _between(value, i, j, k, a, b, c, ratio):
     """Trilinear interpolation of a cell's corners at (a, b, c) fine steps into it."""

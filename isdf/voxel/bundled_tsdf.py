@@ -45,7 +45,7 @@ class BundledTsdf:
         fuse_rays(rays, volume.shape, scales, layers, self._passed, self._ended, self._image)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def fuse_rays(rays, shape, scales, layers, passed, ended, image):
     """Cast the rays of one image.
@@ -91,7 +91,7 @@ def fuse_rays(rays, shape, scales, layers, passed, ended, image):
             _average(layers, v, (length - before) * voxel, gain, scales)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _is_new(end, shape, ended, image):
     """Whether no earlier ray of this image ended in the same cell."""
@@ -106,7 +106,7 @@ def _is_new(end, shape, ended, image):
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _average(layers, v, measured, gain, scales):
     """Put one measurement [m] into a voxel; deeper than a voxel behind the surface it counts less and less."""

@@ -126,7 +126,7 @@ def fuse(frame: DepthFrame, volume: GrowingVolume, config: KinectFusionConfig) -
     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def weigh(view, depth, reach, evidence, log_odds, observed):
     """Add the evidence of the surface that a voxel's pixel shows.

@@ -84,7 +84,7 @@ class NearestObstacle:
         spread(self.lists, mapped.reshape(-1), self.shape, queue)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _unlink(lists, voxel):
     nearest, square, first, before, after = lists
@@ -99,7 +99,7 @@ def _unlink(lists, voxel):
     nearest[voxel], square[voxel] = 0, FAR
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _link(lists, voxel, obstacle, distance):
     nearest, square, first, before, after = lists
@@ -110,7 +110,7 @@ def _link(lists, voxel, obstacle, distance):
     first[obstacle] = voxel
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _square(a, b, shape):
     """Squared distance of two voxels [voxels^2]."""
@@ -121,7 +121,7 @@ def _square(a, b, shape):
     return x * x + y * y + z * z
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def link_all(lists, shape):
     """Make lists and distances anew from `nearest`."""
@@ -133,7 +133,7 @@ def link_all(lists, shape):
             _link(lists, v, obstacle, _square(v, obstacle, shape))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def moved(nearest, old_shape, shape, offset):
     """Adapt `nearest` (flat, of the new shape) to a volume that was `old_shape` and has grown by `offset` below."""
@@ -144,7 +144,7 @@ def moved(nearest, old_shape, shape, offset):
             nearest[v] = 1 + ((x + offset[0]) * shape[1] + y + offset[1]) * shape[2] + z + offset[2]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def insert(inserted, lists, queue):
     """New obstacles are their own nearest."""
@@ -154,7 +154,7 @@ def insert(inserted, lists, queue):
         push(queue, v, 0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def delete(deleted, lists, obstacle, shape, queue):
     """Every voxel of a former obstacle's list turns to the best obstacle that still stands of its neighbours'."""
@@ -179,7 +179,7 @@ def delete(deleted, lists, obstacle, shape, queue):
             v = following
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def spread(lists, mapped, shape, queue):
     """Let every queued voxel ask its neighbours for a nearer obstacle, then tell them of its own, nearest first."""

@@ -63,7 +63,7 @@ def tiny_frame() -> DepthFrame:
     return DepthFrame(torch.ones(4, 4), np.eye(4), PinholeCamera.from_fov(4, 4, 1.0), 0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def pixel_of(view, i, j, k):
     """Flat index of the pixel that voxel (i, j, k) of the box projects onto, -1 if none; and its z-depth [m]."""

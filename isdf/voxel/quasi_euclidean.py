@@ -37,7 +37,7 @@ def update_distances(volume: GrowingVolume, band: float, reach: float) -> None:
     lower_wave(layers, volume.shape, scales, queue)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def collect(layers, shape, scales, queue):
     """Take over what changed in the TSDF; queue what may be lowered, return what must be raised and how many."""
@@ -73,7 +73,7 @@ def collect(layers, shape, scales, queue):
     return raised, count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def raise_wave(raised, count, layers, shape, scales, queue):
     """Forget every distance that came from a raised one; queue the others that border on them."""
@@ -96,7 +96,7 @@ def raise_wave(raised, count, layers, shape, scales, queue):
                 push(queue, n, abs(esdf[n]) / voxel)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def lower_wave(layers, shape, scales, queue):
     """Let every queued voxel offer its distance plus a step to its neighbours, nearest first, until none gains."""
@@ -120,7 +120,7 @@ def lower_wave(layers, shape, scales, queue):
         v = pop(queue)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _offer(mine, other, step, fixed):
     """Distance that a neighbour of distance `other` gets from one of distance `mine`, and whether it is better.

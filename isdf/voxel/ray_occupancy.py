@@ -38,7 +38,7 @@ class RayOccupancy:
         weigh(touched, self._counts, layers, self.scales)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def cast(rays, shape, counts, image):
     """Walk each ray from its end to the eye, until it meets a voxel that another ray of the image has passed.
@@ -85,7 +85,7 @@ def cast(rays, shape, counts, image):
     return touched[:many].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def weigh(touched, counts, layers, scales):
     """Turn the counts of one image into evidence and set them back to zero."""

@@ -36,7 +36,7 @@ def rays_of(frame: DepthFrame, depth: Float[np.ndarray, "h w"], volume: GrowingV
     return Rays((T[:3, 3] - volume.origin) / volume.voxel, ends, z)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def start_walk(start, end, cell, step, ahead, pace):
     """Set up a walk from one point to another; returns how many steps lead to the voxel of the end.
@@ -63,7 +63,7 @@ def start_walk(start, end, cell, step, ahead, pace):
     return steps
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def advance(cell, step, ahead, pace):
     """Move the walk on to the next voxel."""
@@ -76,7 +76,7 @@ def advance(cell, step, ahead, pace):
     ahead[a] += pace[a]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def flat_index(cell, shape):
     """Flat index of a voxel, -1 outside the volume."""

@@ -97,7 +97,7 @@ class TsdfVolume(GrowingVolume):
         average(projection(frame, self, begin, end), images, limits, self.distance, self.weight)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def average(view, images, limits, distances, weights):
     """Put the distance to the surface that a voxel's pixel shows into the voxel's weighted mean.

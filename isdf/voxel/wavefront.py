@@ -38,7 +38,7 @@ def new_queue(voxels: int, buckets: int) -> BucketQueue:
     return BucketQueue(link, heads, tails, lowest)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def push(queue, voxel, key):
     """Add a voxel unless it is queued; the key it came with first stays."""
@@ -54,7 +54,7 @@ def push(queue, voxel, key):
     queue.lowest[0] = min(queue.lowest[0], bucket)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def pop(queue):
     """Take out the first voxel of the lowest bucket; END when the queue is empty."""
@@ -70,7 +70,7 @@ def pop(queue):
     return voxel
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def neighbours(voxel, shape, found):
     """Flat indices of the 26 neighbours, END where they lie outside.

@@ -11,7 +11,7 @@ from numba import njit
 from planning.compiled.arrays import Chain
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def poses(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Poses (frames, 3, 4) of all frames in the root's at a configuration q (dof,)."""
@@ -31,7 +31,7 @@ def poses(chain: Chain, q: np.ndarray) -> np.ndarray:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _moved(chain: Chain, j: int, value: float, out: np.ndarray) -> None:
     """A joint's origin followed by its motion: a slide, or a turn by Rodrigues' formula."""
@@ -53,7 +53,7 @@ def _moved(chain: Chain, j: int, value: float, out: np.ndarray) -> None:
         out[r, 3] = origin[j, r, 3]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def place(frames: np.ndarray, frame: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """World positions (s, 3) of points given in frames."""
@@ -66,7 +66,7 @@ def place(frames: np.ndarray, frame: np.ndarray, centres: np.ndarray) -> np.ndar
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def sphere_centres(chain: Chain, frame: np.ndarray, centres: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Centres (n, s, 3) of spheres at states (n, dof)."""
@@ -76,7 +76,7 @@ def sphere_centres(chain: Chain, frame: np.ndarray, centres: np.ndarray, states:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def pull_back(
     chain: Chain, frame: np.ndarray, states: np.ndarray, points: np.ndarray, forces: np.ndarray

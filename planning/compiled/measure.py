@@ -12,7 +12,7 @@ from planning.compiled.solids import FAR, FLOOR_SLOPE, beyond, grid_sample, soli
 from planning.compiled.states import World, at, gap
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def measure(
     world: World, states: np.ndarray, order: np.ndarray, floor: float, self_floor: float, widest: float
@@ -38,7 +38,7 @@ def measure(
     return depth, link, gaps, pair
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _clearance(world: World, frames: np.ndarray, least: float) -> tuple[float, int]:
     """Least clearance of any leaf below a bound, else the bound, and the link that has it."""
@@ -72,7 +72,7 @@ def _clearance(world: World, frames: np.ndarray, least: float) -> tuple[float, i
     return least, where
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _least_gap(
     ball: np.ndarray, walk: np.ndarray, roots: np.ndarray, pairs: np.ndarray, frames: np.ndarray, least: float

@@ -28,7 +28,7 @@ def planted(start: np.ndarray, goal: np.ndarray, max_nodes: int) -> Trees:
     return Trees(nodes, np.zeros((2, max_nodes), np.int64), np.ones(2, np.int64))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def grow(
     world: World, trees: Trees, rng: np.random.Generator, reach: float, resolution: float, samples: int
@@ -72,7 +72,7 @@ def grow(
     return np.empty((0, dof))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _nearest(world: World, nodes: np.ndarray, size: int, q: np.ndarray) -> int:
     best, where = np.inf, 0
@@ -86,7 +86,7 @@ def _nearest(world: World, nodes: np.ndarray, size: int, q: np.ndarray) -> int:
     return where
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _steered(world: World, origin: np.ndarray, towards: np.ndarray, reach: float) -> np.ndarray:
     """`towards` itself, or the point on the way there as far off as an edge may reach."""
@@ -96,7 +96,7 @@ def _steered(world: World, origin: np.ndarray, towards: np.ndarray, reach: float
     return origin + (towards - origin) * (reach / length)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _added(
     nodes: np.ndarray, parents: np.ndarray, sizes: np.ndarray, side: int, q: np.ndarray, parent: int
@@ -108,7 +108,7 @@ def _added(
     return at
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _joined(nodes: np.ndarray, parents: np.ndarray, side: int, here: int, there: int) -> np.ndarray:
     """The path from the first tree's root over the meeting point to the second's."""
@@ -131,7 +131,7 @@ def _joined(nodes: np.ndarray, parents: np.ndarray, side: int, here: int, there:
     return path
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def length(path: np.ndarray) -> float:
     """Sum of the Euclidean lengths of a path's edges [rad | m]."""
@@ -141,7 +141,7 @@ def length(path: np.ndarray) -> float:
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def shorten(
     world: World, path: np.ndarray, rng: np.random.Generator, resolution: float, rounds: int
@@ -179,7 +179,7 @@ def shorten(
     return path
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _one_joint_straight(
     path: np.ndarray, arc: np.ndarray, first: np.ndarray, last: np.ndarray, a: float, b: float, joint: int
@@ -193,7 +193,7 @@ def _one_joint_straight(
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _path_free(world: World, path: np.ndarray, resolution: float) -> bool:
     if not free(world, path[0]):
@@ -204,7 +204,7 @@ def _path_free(world: World, path: np.ndarray, resolution: float) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _spliced(path: np.ndarray, i: int, j: int, stretch: np.ndarray) -> np.ndarray:
     """Path up to vertex i, a stretch, and from vertex j + 1 on, without repeated points."""

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def pair_costs(
     centres: np.ndarray, radii: np.ndarray, pairs: np.ndarray, eps: float

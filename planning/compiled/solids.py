@@ -14,7 +14,7 @@ FAR = 1e9
 FLOOR_SLOPE = 0.5  # least upward component of the gradient above a floor
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def solid_distance(table: np.ndarray, i: int, x: float, y: float, z: float) -> float:
     """Signed distance [m] of a point to solid i."""
@@ -37,7 +37,7 @@ def solid_distance(table: np.ndarray, i: int, x: float, y: float, z: float) -> f
     return math.sqrt(a * a + b * b + c * c) + inside
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def beyond(table: np.ndarray, i: int, x: float, y: float, z: float, reach: float) -> bool:
     """Whether a point is further than `reach` from solid i for sure, by the ball round it."""
@@ -46,7 +46,7 @@ def beyond(table: np.ndarray, i: int, x: float, y: float, z: float, reach: float
     return dx * dx + dy * dy + dz * dz >= far * far
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def solid_gradient(table: np.ndarray, i: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Unit gradient of `solid_distance`; a fixed direction where there are several."""
@@ -69,7 +69,7 @@ def solid_gradient(table: np.ndarray, i: int, x: float, y: float, z: float) -> t
     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _cylinder_gradient(
     a: float, b: float, c: float, radius: float, half: float
@@ -84,7 +84,7 @@ def _cylinder_gradient(
     return (u, v, 0.0) if r >= h else (0.0, 0.0, up)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _box_gradient(
     a: float, b: float, c: float, sa: float, sb: float, sc: float
@@ -99,7 +99,7 @@ def _box_gradient(
     return (0.0, math.copysign(1.0, b), 0.0) if db >= dc else (0.0, 0.0, math.copysign(1.0, c))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def grid_sample(solids: Solids, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Trilinear distance and its gradient in the grid; beyond its border, the border's value and how far it is."""
@@ -132,7 +132,7 @@ def grid_sample(solids: Solids, x: float, y: float, z: float) -> tuple[float, fl
     return value, gx / voxel, gy / voxel, gz / voxel
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def distances(solids: Solids, points: np.ndarray) -> np.ndarray:
     """Signed distances (n,) [m] of points (n, 3) to the nearest solid."""
@@ -148,7 +148,7 @@ def distances(solids: Solids, points: np.ndarray) -> np.ndarray:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def distances_and_gradients(
     solids: Solids, points: np.ndarray, within: np.ndarray
@@ -178,7 +178,7 @@ def distances_and_gradients(
     return out, gradients
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def solid_is_floor(
     table: np.ndarray, i: int, d: float, x: float, y: float, z: float, tolerance: float

@@ -31,7 +31,7 @@ class World(NamedTuple):
     floor_tolerance: float
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def free(world: World, q: np.ndarray) -> bool:
     """Whether a configuration keeps its limits and margins; links that no joint moves are not looked at."""
@@ -56,7 +56,7 @@ def free(world: World, q: np.ndarray) -> bool:
     return _links_apart(tree.ball, tree.walk, tree.roots, tree.pairs, frames, world.self_margin)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _clear_of_solids(
     ball: np.ndarray,
@@ -103,7 +103,7 @@ def _clear_of_solids(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _clear_of_grid(
     tree: SphereTree, solids: Solids, frames: np.ndarray, margin: float, tolerance: float
@@ -125,7 +125,7 @@ def _clear_of_grid(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _links_apart(
     ball: np.ndarray,
@@ -159,7 +159,7 @@ def _links_apart(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def at(frames: np.ndarray, ball: np.ndarray, walk: np.ndarray, node: int) -> tuple[float, float, float]:
     """World position of a node's centre [m]."""
@@ -172,14 +172,14 @@ def at(frames: np.ndarray, ball: np.ndarray, walk: np.ndarray, node: int) -> tup
     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def gap(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
     """Distance of two points [m]."""
     return math.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def motion(world: World, a: np.ndarray, b: np.ndarray) -> float:
     """Bound [m] on the motion of any sphere from a to b."""
@@ -189,7 +189,7 @@ def motion(world: World, a: np.ndarray, b: np.ndarray) -> float:
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def edge_free(world: World, a: np.ndarray, b: np.ndarray, resolution: float) -> bool:
     """Whether the straight edge from a (known to be free) to b is; coarse states first, then ever finer ones."""
@@ -211,7 +211,7 @@ def edge_free(world: World, a: np.ndarray, b: np.ndarray, resolution: float) -> 
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def first_blocked(world: World, path: np.ndarray, resolution: float) -> int:
     """Index of the first waypoint that is not free or whose edge to the next is not; -1 if the path is free."""

@@ -11,7 +11,7 @@ PRECISION = 1e-7  # of the greatest speeds, relative
 SLIGHT = 1e-12  # slopes below count as none: the joint does not care how the path speeds up
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def path_speeds(
     ds: np.ndarray, slope: np.ndarray, bend: np.ndarray, v_max: np.ndarray, a_max: np.ndarray
@@ -41,7 +41,7 @@ def path_speeds(
     return x
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _highest(
     ds: float, slope: np.ndarray, bend: np.ndarray, v_max: np.ndarray, a_max: np.ndarray, after: float
@@ -67,7 +67,7 @@ def _highest(
     return low
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _leads_to(
     ds: float, slope: np.ndarray, bend: np.ndarray, a_max: np.ndarray, after: float, x: float
@@ -77,7 +77,7 @@ def _leads_to(
     return least <= most and x + 2.0 * ds * least <= after and x + 2.0 * ds * most >= 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _accelerations(
     ds: float, slope: np.ndarray, bend: np.ndarray, a_max: np.ndarray, x: float

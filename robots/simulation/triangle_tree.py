@@ -86,7 +86,7 @@ def feature_normals(mesh: trimesh.Trimesh) -> Float[np.ndarray, "m 7 3"]:
     return np.concatenate([vertex[faces], edge[which], face[:, None]], axis=1)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def signed_distances(tree, points):
     """Signed distances (k,) [m] of points (k, 3) to the union of the bodies, and their gradients (k, 3).
@@ -127,7 +127,7 @@ def signed_distances(tree, points):
     return distance, gradient
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _search(tree, root, p, bound):
     """Square distance below `bound` of p to a body, the triangle, its feature and the nearest point; -1 for none."""
@@ -154,7 +154,7 @@ def _search(tree, root, p, bound):
     return bound, found, feature, x, y, z
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _box_square(tree, node, p):
     """Square distance of p to a node's box; 0 inside."""
@@ -167,7 +167,7 @@ def _box_square(tree, node, p):
     return square
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 @no_type_check
 def _closest(corners, p):
     """Nearest point of a triangle and the feature it lies on (Ericson, Real-Time Collision Detection, 5.1.5)."""
