@@ -36,15 +36,15 @@ class LiftObject(EpisodeOptions):
     """Clearance the arm keeps in the map where start and goal allow it [m]."""
 
 
-def look_over(episode: Episode, middle: np.ndarray, yaw: float, looks: int) -> isdf.Mapper:
+def look_over(episode: Episode, middle: np.ndarray, yaw: float, looks: int) -> DistanceField:
     """A map of the table: the head looks at the object and to both sides of it."""
-    mapper, side = isdf.Mapper(), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    mapper, side = episode.mapper, np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     for number in range(looks):
         episode.robot.look_at(middle + (0.0, 0.3, -0.3)[number % 3] * side)
         episode.robot.wait(0.4)
         mapper.integrate(episode.robot.observe())
-    mapper.refresh()
-    return mapper
+        mapper.run_for(0.4)  # what trains, trains; the others bring their distances up to date
+    return mapper.field()
 
 
 def choose(
@@ -71,11 +71,10 @@ def main(options: LiftObject) -> float:
     episode = Episode(dataclasses.replace(options), task.park)
     robot, world = episode.robot, episode.world
     middle = world.object_pose(task.object_name)[:3, 3].copy()
-    mapper = look_over(episode, middle, task.park[2], options.looks)
-    field = mapper.field()
+    field = look_over(episode, middle, task.park[2], options.looks)
     options.out.mkdir(parents=True, exist_ok=True)
     around = torch.as_tensor(np.stack([middle - 1.0, middle + 1.0]), dtype=torch.float32)
-    field.plot_slice(float(middle[2]), bounds=around).savefig(options.out / "slice.png")
+    isdf.plot_slice(field, float(middle[2]), bounds=around).savefig(options.out / "slice.png")
 
     chosen = choose(episode, field, middle, options)
     if chosen is None:

@@ -4,13 +4,17 @@ The pybullet world that stands in for the real one is the subpackage `robots.sim
 imported by name, since it needs a simulator.
 """
 
+import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 if find_spec("pytorch_kinematics") is None:
-    raise ModuleNotFoundError(
+    lacking = (
         "robots needs pytorch-kinematics, which is not installed: pip install 'isdf-planning[robots]' for the models, "
         "or 'isdf-planning[simulation]' for the simulator too"
     )
+    # The command, which imports this first, says so in one line.
+    raise SystemExit(lacking) if Path(sys.argv[0]).stem == "robots" else ModuleNotFoundError(lacking)
 
 from robots.errors import (
     RobotError,
