@@ -201,7 +201,7 @@ def episode(task: Task) -> dict:
     folder.mkdir(parents=True, exist_ok=True)
     ride.robot.recording.save(folder / "states.npz")
     ride.close()
-    again = recheck(task.the_scene(), folder / "states.npz") if task.disturb != "moved" else None
+    again = recheck(task.the_scene(), folder / "states.npz")
     return {
         "success": drive.success and drive.goal_distance < 0.1 and not contacts,
         "reached": drive.success and drive.goal_distance < 0.1,
@@ -254,9 +254,7 @@ def summary(options: Options, reports: list[dict]) -> str:
     lines = [f"| {' | '.join(map(str, cells))} |" for cells in (head, ["---"] * len(head), row)]
     for report in reports:
         reason = report.get("error") or (report["drive"]["message"] if not report["reached"] else "")
-        touch = (
-            "" if "error" in report else ", ".join(report["contacts"] | (report["contacts_rechecked"] or {}))
-        )
+        touch = "" if "error" in report else ", ".join(report["contacts"] | report["contacts_rechecked"])
         if reason or touch:
             number = report["task"]["number"]
             lines.append(

@@ -8,11 +8,15 @@ import numpy as np
 import pybullet
 
 import robots
+from examples.disturbances import People
 from robots.simulation import Cylinder, Scene, World
 from robots.simulation.poses import planar_pose
 
 TOUCH = 0.0005
 """Bodies that overlap by less than this [m] only touch in passing: the physics' own tolerance."""
+
+AWAY = planar_pose(0.0, 0.0, 50.0)
+"""Where a solid waits that is not in the world yet."""
 
 
 def recheck(scene: Scene, states: Path, every: int = 1) -> dict[str, float]:
@@ -34,11 +38,11 @@ def recheck(scene: Scene, states: Path, every: int = 1) -> dict[str, float]:
         names = [str(name) for name in data["object_names"]]
         for name in names:
             if name not in world.solids:  # a person, who came with the episode
-                world.add_body(Cylinder(name, planar_pose(0.0, 0.0, 5.0), 0.22, 1.7))
+                world.add_body(Cylinder(name, AWAY, People.RADIUS, People.HEIGHT))
         for index in range(0, len(data["time"]), every):
             robot.reset(data["joint_positions"][index])
             for name, pose in zip(names, data["object_poses"][index], strict=True):
-                world.set_object_pose(name, pose)
+                world.set_object_pose(name, AWAY if np.isnan(pose).any() else pose)
             pybullet.performCollisionDetection(physicsClientId=world.client)
             for pair, depth in _overlaps(world).items():
                 deepest[pair] = max(deepest.get(pair, 0.0), depth)

@@ -24,8 +24,9 @@ class Recording:
         """Time [s] and contact of every robot link with every body, of all steps."""
         self._times: list[float] = []
         self._postures: list[np.ndarray] = []
-        self._movable = [name for name, solid in world.solids.items() if solid.mass > 0]
-        self._poses: list[np.ndarray] = []
+        self._at_start = world.solids
+        self._movers = {name: None for name, solid in self._at_start.items() if solid.mass > 0}
+        self._poses: list[dict[str, np.ndarray]] = []
 
     def __len__(self) -> int:
         return len(self._times)
@@ -34,7 +35,12 @@ class Recording:
         """Record where everything is now, and what touched since the last step of physics."""
         self._times.append(self.world.time)
         self._postures.append(self.world.robot_state()[0])
-        self._poses.append(np.array([self.world.object_pose(n) for n in self._movable]).reshape(-1, 4, 4))
+        solids = self.world.solids
+        # The world replaces a static solid that is put elsewhere.
+        self._movers |= {
+            name: None for name, solid in solids.items() if solid is not self._at_start.get(name)
+        }
+        self._poses.append({name: self.world.object_pose(name) for name in self._movers if name in solids})
         self.contacts += [(self.world.time, contact) for contact in self.world.contacts()]
 
     def base_poses(self) -> Float[np.ndarray, "n 3"]:
@@ -54,7 +60,8 @@ class Recording:
         """Write the states to an .npz file.
 
         It holds time (n,) [s], joint_names, joint_positions (n, dof), object_names, object_poses (n, k, 4, 4) [m],
-        and base_pose (n, 3) [m, m, rad] where the robot has a base.
+        and base_pose (n, 3) [m, m, rad] where the robot has a base. Objects are the solids with a mass and those that
+        were moved or added, NaN while they are not in the world.
         """
         names = self.world.robot.joint_names
         postures = np.array(self._postures).reshape(len(self), len(names))
@@ -62,9 +69,20 @@ class Recording:
             "time": np.array(self._times),
             "joint_names": np.array(names),
             "joint_positions": postures,
-            "object_names": np.array(self._movable),
-            "object_poses": np.array(self._poses).reshape(len(self), len(self._movable), 4, 4),
+            "object_names": np.array(list(self._movers), dtype=str),
+            "object_poses": self._object_poses(),
         }
         if names[:3] == ("base_x", "base_y", "base_yaw"):
             arrays["base_pose"] = postures[:, :3]
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+
+    def _object_poses(self) -> Float[np.ndarray, "n k 4 4"]:
+        """Of all that ever moved, at every state."""
+        poses = np.full((len(self), len(self._movers), 4, 4), np.nan)
+        for k, name in enumerate(self._movers):
+            if name in self._at_start:
+                poses[:, k] = self._at_start[name].pose
+            for n, state in enumerate(self._poses):
+                if name in state:
+                    poses[n, k] = state[name]
+        return poses

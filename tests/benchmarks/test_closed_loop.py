@@ -80,6 +80,32 @@ def test_contacts_are_found_anew_from_the_states(tmp_path: Path, x: float, touch
     assert bool(found) == touches, "the floor is no contact"
 
 
+def test_what_comes_and_moves_during_an_episode_is_recorded_and_found_anew(tmp_path: Path) -> None:
+    free = np.array([[2.0, 0.5], [2.0, 0.6]])
+    with World(hall()) as world:
+        robot = drive_in(world, -1.2)
+        robot.drive(0.0, 0.0, 0.1)
+        People(free, 0.1, seed=0, count=1).advance(robot, 0.1)
+        old = world.object_pose("west")
+        moved = old.copy()
+        moved[0, 3] -= 1.0
+        world.set_object_pose("west", moved)
+        robot.drive(0.0, 0.0, 0.1)
+        robot.recording.save(tmp_path / "states.npz")
+    with np.load(tmp_path / "states.npz") as saved:
+        data = dict(saved)
+    assert sorted(data["object_names"]) == ["person_0", "west"]
+    person, west = (
+        data["object_poses"][:, list(data["object_names"]).index(n)] for n in ("person_0", "west")
+    )
+    assert np.isnan(person[0]).all() and person[-1, 0, 3] == pytest.approx(2.0, abs=0.1)
+    np.testing.assert_allclose(west[[0, -1]], [old, moved], atol=1e-6)
+    assert not recheck(hall(), tmp_path / "states.npz")
+    data["joint_positions"][-1, :2] = person[-1, :2, 3]
+    np.savez(tmp_path / "states.npz", **data)
+    assert any(pair.endswith("- person_0") for pair in recheck(hall(), tmp_path / "states.npz"))
+
+
 def frame(time: float = 0.0) -> DepthFrame:
     camera = PinholeCamera.from_fov(16, 12)
     return DepthFrame(np.ones((12, 16), dtype=np.float32), np.eye(4), camera, time)
