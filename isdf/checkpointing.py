@@ -17,6 +17,8 @@ from .methods import OnlineMapper, load_map
 from .runner import Begun, RunReport, Watch
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# A frame and a saving may take so many times the slowest of late, which count less with every further one.
+CAUTION, FADING = 1.5, 0.95
 
 
 class Stopped(Exception):
@@ -35,8 +37,9 @@ class Stopped(Exception):
 class Checkpointer:
     """A watcher of a run that saves its map, with what it takes to resume the run, atomically.
 
-    It saves at the first frame, then so that a process killed at any moment has lost at most `every` seconds, as long
-    as a single frame takes less than that: the time since the last call and that of saving count as the next one's.
+    It saves at the first frame, then so that a process killed at any moment has lost at most `every` seconds: early
+    enough for one more frame and for saving, should both take somewhat longer than the slowest of late. Only a frame
+    that takes much longer than those before it can cost more.
 
     As a context manager it takes over SIGINT and SIGTERM: the first one stops the run after the frame it is on, with
     a checkpoint and `Stopped`; the second interrupts at once and the last checkpoint stays.
@@ -54,7 +57,8 @@ class Checkpointer:
     ) -> None:
         self.path, self.every, self.report, self.options = path, every, report, options
         self._watch = watch
-        self._saved_at, self._called_at, self._cost = -float("inf"), time.monotonic(), 0.0
+        self._saved_at, self._called_at = -float("inf"), time.monotonic()
+        self._gap = self._cost = 0.0  # slowest frame and slowest saving of late [s]
         self._signal: int | None = None
         self._former: dict[int, Any] = {}
 
@@ -66,10 +70,11 @@ class Checkpointer:
         """
         self._watch(mapper, arrived)
         now = time.monotonic()
-        gap, self._called_at = now - self._called_at, now
+        self._gap = max(now - self._called_at, FADING * self._gap)
+        self._called_at = now
         if self._signal is not None:
             raise Stopped(self._signal, self.save(mapper, finished=False))
-        if mapper.frames_seen and now - self._saved_at + gap + self._cost >= self.every:
+        if mapper.frames_seen and now - self._saved_at + CAUTION * (self._gap + self._cost) >= self.every:
             self.save(mapper, finished=False)
 
     def save(self, mapper: OnlineMapper, finished: bool) -> bool:
@@ -87,7 +92,7 @@ class Checkpointer:
             return False
         # The file holds the map of this moment, not of when it was complete.
         self._saved_at, self._called_at = started, time.monotonic()
-        self._cost = self._called_at - started
+        self._cost = max(self._called_at - started, FADING * self._cost)
         return True
 
     def __enter__(self) -> Checkpointer:

@@ -87,8 +87,8 @@ def test_kill_9_loses_at_most_the_period_and_never_the_file(kills, method, tmp_p
         "losses",
         f"{kills} kills: median loss {np.median(losses):.2f} s, worst {max(losses):.2f} s, {left} during a save",
     )
-    # The machine may be busy with other things, and of two kills both may meet that.
-    assert max(losses) < EVERY + 3.0 and (kills <= 2 or np.median(losses) < EVERY)
+    # On an idle machine none loses more than the period; a busy one may stop a process for longer than a frame.
+    assert np.quantile(losses, 0.9) <= EVERY + (1.0 if kills <= 2 else 0.1) and max(losses) < EVERY + 2.0
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
