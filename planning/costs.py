@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from planning.compiled.self_collision import PairGroups
 
 
 def hinge_cost(
@@ -57,10 +62,16 @@ def arc_length_cost(
 def self_collision_cost(
     centres: Float[Tensor, "*batch n s 3"],
     radii: Float[Tensor, " s"],
-    pairs: Int[Tensor, "p 2"],
+    groups: PairGroups,
     eps: float,
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch n s 3"], Float[Tensor, "*batch n"]]:
     """Sum over waypoints and pairs of c(gap between two spheres), averaged over the waypoints.
+
+    Args:
+        centres: of the spheres at n waypoints [m].
+        radii: of the spheres [m].
+        groups: the pairs that must not touch, from `planning.compiled.self_collision.grouped`.
+        eps: gap at which the cost starts [m].
 
     Returns:
         The cost [m], its gradient with respect to the centres, and the smallest gap [m] at each waypoint.
@@ -69,7 +80,7 @@ def self_collision_cost(
 
     n, s = centres.shape[-3:-1]
     flat = centres.detach().reshape(-1, s, 3).double().numpy()
-    cost, gradient, gap = pair_costs(flat, radii.double().numpy(), pairs.numpy(), eps)
+    cost, gradient, gap = pair_costs(flat, radii.double().numpy(), groups, eps)
     batch = centres.shape[:-2]
     return (
         torch.from_numpy(cost).to(centres).view(batch).mean(-1),

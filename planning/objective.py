@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,7 +12,7 @@ from torch import Tensor
 from planning.costs import arc_length_cost, hinge_cost, self_collision_cost
 from planning.errors import ConfigError
 from planning.metric import Metric
-from planning.protocols import SelfCollidingRobot, SphereRobot
+from planning.protocols import LinkedRobot, SelfCollidingRobot, SphereRobot
 from planning.sphere_kinematics import kinematics_of
 from planning.workspace import Workspace
 
@@ -87,6 +88,7 @@ class Objective:
         self._kinematics = kinematics_of(robot)
         pairs = robot.self_collision_pairs if isinstance(robot, SelfCollidingRobot) else None
         self._pairs = pairs if pairs is not None and len(pairs) else None
+        self._groups: Any = None
         self._known_radii: Tensor | None = None
         margin = torch.tensor(config.margin, dtype=torch.float64)
         self._free_cost = float(hinge_cost(margin, workspace.eps)[0]) + 1e-7
@@ -103,7 +105,9 @@ class Objective:
         ends = cost[..., [0, -1], :].amax((-2, -1)).clamp_min(self._free_cost)
         free = (cost <= ends[..., None, None]).all(-1).all(-1)
         if self._pairs is not None:
-            touch, push, gap = self_collision_cost(x, radii, self._pairs, self.config.self_collision_eps)
+            touch, push, gap = self_collision_cost(
+                x, radii, self._pair_groups(x, radii), self.config.self_collision_eps
+            )
             obstacles = obstacles + self.config.self_collision_weight * touch
             pull = pull + self.config.self_collision_weight * push
             ends_gap = gap[..., [0, -1]].amin(-1, keepdim=True).clamp_max(0.0)
@@ -119,6 +123,17 @@ class Objective:
             with torch.no_grad():
                 self._known_radii = self.robot.spheres(q.reshape(-1, q.shape[-1])[0])[1].to(q)
         return self._known_radii
+
+    def _pair_groups(self, x: Float[Tensor, "*batch n s 3"], radii: Float[Tensor, " s"]) -> Any:
+        """The pairs that must not touch, grouped by link at the first question."""
+        if self._groups is None:
+            from planning.compiled.self_collision import grouped
+
+            links = self.robot.sphere_links if isinstance(self.robot, LinkedRobot) else None
+            state = x.detach().reshape(-1, *x.shape[-2:])[0]
+            assert self._pairs is not None
+            self._groups = grouped(self._pairs.numpy(), links, state.double().numpy(), radii.double().numpy())
+        return self._groups
 
     def tightened(self, waypoints_free: bool) -> Objective:
         """The objective for a trajectory that converged in collision.

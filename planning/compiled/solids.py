@@ -11,6 +11,7 @@ from numba import njit
 from planning.compiled.arrays import Solids
 
 FAR = 1e9
+GROUP = 16  # points that share one test for what is close
 FLOOR_SLOPE = 0.5  # least upward component of the gradient above a floor
 
 
@@ -159,23 +160,53 @@ def distances_and_gradients(
     """
     out = np.empty(len(points))
     gradients = np.empty((len(points), 3))
-    for p in range(len(points)):
-        x, y, z = points[p]
-        nearest, gx, gy, gz, winner = within[p % len(within)], 0.0, 0.0, 0.0, -1
-        if len(solids.grid) > 0:
-            d, ux, uy, uz = grid_sample(solids, x, y, z)
-            if not d >= nearest:
-                nearest, gx, gy, gz = d, ux, uy, uz
-        for i in range(len(solids.table)):
-            if not beyond(solids.table, i, x, y, z, max(nearest, 0.0)):
-                d = solid_distance(solids.table, i, x, y, z)
+    close = np.empty(len(solids.table), np.int64)
+    for first in range(0, len(points), GROUP):
+        last = min(first + GROUP, len(points))
+        count = _close_to_group(solids.table, points, within, first, last, close)
+        for p in range(first, last):
+            x, y, z = points[p]
+            nearest, gx, gy, gz, winner = within[p % len(within)], 0.0, 0.0, 0.0, -1
+            if len(solids.grid) > 0:
+                d, ux, uy, uz = grid_sample(solids, x, y, z)
                 if not d >= nearest:
-                    nearest, winner = d, i
-        if winner >= 0:
-            gx, gy, gz = solid_gradient(solids.table, winner, x, y, z)
-        out[p] = nearest
-        gradients[p, 0], gradients[p, 1], gradients[p, 2] = gx, gy, gz
+                    nearest, gx, gy, gz = d, ux, uy, uz
+            for c in range(count):
+                i = close[c]
+                if not beyond(solids.table, i, x, y, z, max(nearest, 0.0)):
+                    d = solid_distance(solids.table, i, x, y, z)
+                    if not d >= nearest:
+                        nearest, winner = d, i
+            if winner >= 0:
+                gx, gy, gz = solid_gradient(solids.table, winner, x, y, z)
+            out[p] = nearest
+            gradients[p, 0], gradients[p, 1], gradients[p, 2] = gx, gy, gz
     return out, gradients
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _close_to_group(
+    table: np.ndarray, points: np.ndarray, within: np.ndarray, first: int, last: int, close: np.ndarray
+) -> int:
+    """Write the solids that may be nearer than `within` to any of the points first to last; returns how many.
+
+    Neighbours in a list of spheres are mostly neighbours in space, so that one ball round them spares most tests.
+    """
+    x, y, z = points[first]
+    spread, reach = 0.0, 0.0
+    for p in range(first, last):
+        dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+        d = dx * dx + dy * dy + dz * dz
+        spread = d if d > spread else (spread if d <= spread else np.inf)  # a NaN must meet all solids
+        reach = max(reach, within[p % len(within)])
+    spread = math.sqrt(spread)
+    count = 0
+    for i in range(len(table)):
+        if not beyond(table, i, x, y, z, reach + spread):
+            close[count] = i
+            count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)

@@ -1,6 +1,9 @@
+import numpy as np
 import pytest
 import torch
 
+import robots
+from planning.compiled.self_collision import grouped
 from planning.costs import arc_length_cost, hinge_cost, self_collision_cost
 from tests.gradients import assert_gradient_matches
 
@@ -78,19 +81,40 @@ def test_self_collision_gradient_and_gap():
     generator = torch.Generator().manual_seed(1)
     x = 0.3 * torch.rand(3, 5, 3, generator=generator, dtype=torch.float64)
     radii = torch.full((5,), 0.05, dtype=torch.float64)
-    pairs = torch.tensor([[0, 2], [0, 3], [1, 4]])
-    cost, _, gap = self_collision_cost(x, radii, pairs, 0.2)
+    pairs = np.array([[0, 2], [0, 3], [1, 4]])
+    groups = grouped(pairs, None, x[0].numpy(), radii.numpy())
+    cost, _, gap = self_collision_cost(x, radii, groups, 0.2)
     assert cost > 0
     expected = min(float((x[1, i] - x[1, j]).norm()) - 0.1 for i, j in pairs.tolist())
     assert float(gap[1]) == pytest.approx(expected)
     assert_gradient_matches(
-        lambda p: self_collision_cost(p, radii, pairs, 0.2)[0],
-        lambda p: self_collision_cost(p, radii, pairs, 0.2)[1],
+        lambda p: self_collision_cost(p, radii, groups, 0.2)[0],
+        lambda p: self_collision_cost(p, radii, groups, 0.2)[1],
         x,
     )
 
 
 def test_coinciding_spheres_have_a_finite_gradient():
     x, radii = torch.zeros(1, 2, 3), torch.full((2,), 0.1)
-    cost, gradient, gap = self_collision_cost(x, radii, torch.tensor([[0, 1]]), 0.05)
+    groups = grouped(np.array([[0, 1]]), None, x[0].numpy(), radii.numpy())
+    cost, gradient, gap = self_collision_cost(x, radii, groups, 0.05)
     assert gradient.isfinite().all() and cost.isfinite() and float(gap) == pytest.approx(-0.2)
+
+
+def test_groups_of_links_change_nothing_but_the_time():
+    robot = robots.load("panda")
+    low, high = robot.joint_limits.double().unbind(1)
+    q = low + (high - low) * torch.rand(
+        60, robot.num_dofs, generator=torch.Generator().manual_seed(2), dtype=torch.float64
+    )
+    centres, radii = robot.spheres(q)
+    known, links = robot.self_collision_pairs.numpy(), robot.sphere_links
+    alone, by_link = (
+        grouped(known, names, centres[7].double().numpy(), radii.double().numpy()) for names in (None, links)
+    )
+    assert len(by_link.reach) < len(alone.reach) / 100
+    x = centres.double().unsqueeze(1)
+    one, other = (self_collision_cost(x, radii.double(), groups, 0.03) for groups in (alone, by_link))
+    assert (one[0] > 0).sum() > 10
+    for a, b in zip(one, other, strict=True):
+        torch.testing.assert_close(a, b)
