@@ -77,7 +77,9 @@ def save_bars(
         dpi: of the picture.
     """
     names = list(dict.fromkeys(name for group in groups.values() for name in group))
-    figure = Figure(figsize=(1.2 + 0.28 * (len(names) + 1) * len(groups), 2.9), layout="constrained")
+    longest = max(len(group) for group in groups)
+    width = max(0.28 * (len(names) + 1), 0.1 * longest + 0.1)  # room for the bars of a group and its name [inch]
+    figure = Figure(figsize=(1.2 + width * len(groups), 2.9), layout="constrained")
     ax = figure.subplots()
     for number, name in enumerate(names):
         at = np.arange(len(groups)) + (number - (len(names) - 1) / 2) * 0.8 / len(names)
