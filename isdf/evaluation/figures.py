@@ -78,7 +78,9 @@ def save_bars(
     """
     names = list(dict.fromkeys(name for group in groups.values() for name in group))
     longest = max(len(group) for group in groups)
-    width = max(0.28 * (len(names) + 1), 0.1 * longest + 0.1)  # room for the bars of a group and its name [inch]
+    width = max(
+        0.28 * (len(names) + 1), 0.1 * longest + 0.1
+    )  # room for the bars of a group and its name [inch]
     figure = Figure(figsize=(1.2 + width * len(groups), 2.9), layout="constrained")
     ax = figure.subplots()
     for number, name in enumerate(names):
