@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -171,16 +170,8 @@ class Workspace:
         centres_above = centres[..., self.floor, :]
         exempt = (floor_distance - centres_above[..., 2]).abs() <= self.config.floor_tolerance
         if exempt.any():
-            exempt[exempt.clone()] = self._gradients(centres_above[exempt])[..., 2] > MIN_FLOOR_SLOPE
+            _, gradient = self.field.distance_and_gradient(centres_above[exempt])
+            exempt[exempt.clone()] = gradient[..., 2] > MIN_FLOOR_SLOPE
         on_floor = torch.zeros(centres.shape[:-1], dtype=torch.bool)
         on_floor[..., self.floor] = exempt
         return on_floor
-
-    def _gradients(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Gradients of the field, by compiled code where it can be."""
-        if self._solids is None:
-            return self.field.distance_and_gradient(points)[1]
-        from planning.compiled.solids import FAR, distances_and_gradients
-
-        found = distances_and_gradients(self._solids, points.detach().double().numpy(), np.array([FAR]))[1]
-        return torch.from_numpy(found).to(points)

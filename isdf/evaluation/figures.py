@@ -77,10 +77,8 @@ def save_bars(
         dpi: of the picture.
     """
     names = list(dict.fromkeys(name for group in groups.values() for name in group))
-    longest = max(len(group) for group in groups)
-    width = max(
-        0.28 * (len(names) + 1), 0.1 * longest + 0.1
-    )  # room for the bars of a group and its name [inch]
+    # Room for the bars of a group and for its name [inch].
+    width = max(0.28 * (len(names) + 1), 0.1 + 0.1 * max(map(len, groups)))
     figure = Figure(figsize=(1.2 + width * len(groups), 2.9), layout="constrained")
     ax = figure.subplots()
     for number, name in enumerate(names):
