@@ -2,7 +2,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo test test-slow lint types docs benchmark clean
+.PHONY: help setup demo test test-slow test-pythons lint types docs benchmark clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*##/\t/'
@@ -22,6 +22,10 @@ test: setup      ## all tests but the slow ones
 
 test-slow: setup  ## the slow tests
 	$(RUN) -m pytest -m slow
+
+test-pythons: setup  ## tests and a core install on every Python from 3.10 to 3.13 that is here
+	$(RUN) -m pip install --quiet --constraint constraints.txt nox
+	$(RUN) -m nox
 
 lint: setup      ## style and formatting
 	$(VENV)/bin/ruff check .
