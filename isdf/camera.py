@@ -11,8 +11,9 @@ from torch import Tensor
 
 from .errors import CameraError
 
-# Largest |x / z| of a ray, 89.9 degrees, and longest focal length in image sizes.
-STEEPEST, LONGEST = 600.0, 1e5
+# Largest |x / z| of a ray, 84 degrees from the axis (wider lenses are no pinholes), and longest focal length in image
+# sizes.
+STEEPEST, LONGEST = 10.0, 1e5
 # Pixels of a depth camera are about square; binning one axis makes them twice or four times as long as wide.
 LONGEST_PIXEL = 10.0
 
@@ -55,8 +56,9 @@ class PinholeCamera:
             slope = max(abs(centre), abs(size - 1 - centre)) / focal
             if slope > STEEPEST or focal > LONGEST * size:
                 raise CameraError(
-                    f"f{name} = {focal} and c{name} = {centre} are no camera of {size} pixels: focal lengths are "
-                    "pixels, not metres, and the centre lies in the image"
+                    f"f{name} = {focal} and c{name} = {centre} are no pinhole camera of {size} pixels, whose rays lean "
+                    f"at most {math.degrees(math.atan(STEEPEST)):.0f} degrees: focal lengths are pixels, not metres, "
+                    "and the centre lies in the image or near it"
                 )
 
     @classmethod

@@ -94,6 +94,13 @@ def test_impossible_cameras_are_refused(bad: dict) -> None:
         PinholeCamera(**values)
 
 
+def test_a_centre_far_outside_the_image_is_refused() -> None:
+    """A wrong centre of a small image would stretch a room over a hundred metres."""
+    with pytest.raises(CameraError, match="at most 84 degrees"):
+        PinholeCamera(69.3, 69.3, 3537.0, 29.5, 80, 60)
+    PinholeCamera(69.3, 69.3, 200.0, 29.5, 80, 60)  # a cut-out of a larger image
+
+
 def test_places_and_times_that_numbers_cannot_hold_are_refused() -> None:
     far = np.eye(4)
     far[1, 3] = 4.6e6  # a UTM northing
