@@ -105,6 +105,6 @@ def _read_camera(path: Path, size: tuple[int, int]) -> tuple[PinholeCamera, np.n
         camera = PinholeCamera(fx * across, fy * down, *centre, *size)
     except KeyError as error:
         raise DatasetError(f"{path}: {error} missing") from error
-    except (OSError, TypeError, ValueError, ZeroDivisionError, CameraError) as error:
+    except (OSError, TypeError, ValueError, ArithmeticError, CameraError) as error:
         raise DatasetError(f"{path}: {error}") from error
     return camera, pose @ OPENGL_FROM_OPENCV

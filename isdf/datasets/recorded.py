@@ -108,7 +108,7 @@ def _read_intrinsics(path: Path) -> tuple[PinholeCamera, float, tuple[float, ...
         invalid = values.get("invalid_values", values.get("invalid", []))
         fps = None if fps is None else float(fps)
         invalid = (0.0, *(float(v) for v in invalid))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DatasetError(f"{path}: {error}") from error
     if not scale > 0:
         raise DatasetError(f"{path}: depth_scale must be positive (values a metre), got {scale}")

@@ -112,7 +112,7 @@ def _read_camera(path: Path) -> tuple[PinholeCamera, float]:
         camera = PinholeCamera(fx, fy, cx, cy, int(values["w"]), int(values["h"]))
     except KeyError as error:
         raise DatasetError(f"{path}: {error} missing; expected camera: w h fx fy cx cy scale") from error
-    except (OSError, TypeError, ValueError) as error:
+    except (OSError, TypeError, ValueError, OverflowError) as error:
         raise DatasetError(f"{path}: {error}") from error
     if not scale > 0:
         raise DatasetError(f"{path}: scale must be positive (values a metre), got {scale}")

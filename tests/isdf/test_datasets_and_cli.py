@@ -82,6 +82,8 @@ def test_broken_sequences_name_the_file_and_the_fault(sequence_dir) -> None:
         ("{", "not valid JSON"),
         ("{}", "missing"),
         (good.replace("5000.0", "0"), "depth_scale"),
+        (good.replace('"width": 80', '"width": Infinity'), "infinity"),
+        (good.replace('"width": 80', '"width": 80, "cx": 1' + "0" * 400), "too large"),
     ):
         intrinsics.write_text(text)
         with pytest.raises(DatasetError, match=rf"intrinsics\.json: .*{fault}"):

@@ -154,6 +154,7 @@ def test_replica_faults_name_the_file(tmp_path) -> None:
         ("{", "Expecting"),
         ("{}", "camera"),
         (good.replace("6553.5", "0"), "scale must be positive"),
+        (good.replace('"h": ', '"h": 1e999, "_": '), "infinity"),
     ):
         parameters.write_text(text)
         with pytest.raises(DatasetError, match=rf"cam_params\.json: .*{fault}"):
@@ -331,6 +332,9 @@ def test_polycam_faults_and_depth_out_of_range(tmp_path) -> None:
         PolycamSequence(tmp_path)[1]
     (folder / "corrected_cameras" / "5000000.json").write_text('{"fx": 80}')
     with pytest.raises(DatasetError, match=r"5000000\.json: 'fy' missing"):
+        PolycamSequence(tmp_path)
+    (folder / "corrected_cameras" / "5000000.json").write_text('{"fx": 1' + "0" * 400 + "}")
+    with pytest.raises(DatasetError, match=r"5000000\.json: .*too large"):
         PolycamSequence(tmp_path)
     for path in (folder / "corrected_cameras").iterdir():
         path.rename(path.with_name("7" + path.name))
