@@ -12,6 +12,7 @@ from PIL import Image
 
 from ..camera import PinholeCamera
 from ..errors import CameraError, DatasetError
+from .sequence import UNREADABLE
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ def decode_depth(message: Any, name: str) -> Float[np.ndarray, "h w"]:
         try:
             with Image.open(BytesIO(bytes(message.data[COMPRESSED_HEADER:]))) as image:
                 return np.array(image).astype(np.float32) / SCALES["16UC1"]
-        except (OSError, SyntaxError) as error:
+        except UNREADABLE as error:
             raise DatasetError(f"{name}: not a readable PNG ({error})") from error
     if message.encoding not in SCALES:
         raise DatasetError(

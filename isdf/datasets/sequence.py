@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..camera import PinholeCamera
 from ..errors import CameraError, DatasetError
 from ..frames import DepthFrame
 
 DEFAULT_FPS = 30.0
+# What Pillow raises at damaged or gigantic images, by where the damage is.
+UNREADABLE = (OSError, SyntaxError, ValueError, struct.error, zlib.error, Image.DecompressionBombError)
 
 
 @runtime_checkable
@@ -106,7 +110,7 @@ def read_depth(path: Path, depth_scale: float, invalid: tuple[float, ...] = (0,)
             values = np.array(image)
     except FileNotFoundError as error:
         raise DatasetError(f"{path}: missing, though the sequence has a pose for it") from error
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except UNREADABLE as error:
         raise DatasetError(f"{path}: not a readable image ({error})") from error
     if values.ndim != 2:
         raise DatasetError(f"{path}: a depth image has one channel, this one has shape {values.shape}")
@@ -120,7 +124,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             return image.size
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except UNREADABLE as error:
         raise DatasetError(f"{path}: not a readable image ({error})") from error
 
 

@@ -19,6 +19,9 @@ from isdf.runner import run_at_rate, run_at_steps, run_every_frame
 from isdf.slices import estimate_up, slice_basis
 from tests.isdf.rooms import furnished_orbit
 
+# A PNG whose header has no room for what it must say.
+SHORT_HEADER = b"\x89PNG\r\n\x1a\n" + (12).to_bytes(4, "big") + b"IHDR" + bytes(16)
+
 
 @pytest.fixture
 def sequence_dir(tmp_path) -> Path:
@@ -70,10 +73,11 @@ def test_broken_sequences_name_the_file_and_the_fault(sequence_dir) -> None:
     with pytest.raises(DatasetError, match=r"depth, poses\.txt, intrinsics\.json missing"):
         RecordedSequence(sequence_dir / "depth")
     (sequence_dir / "depth" / "000004.png").write_bytes(b"not an image")
+    (sequence_dir / "depth" / "000003.png").write_bytes(SHORT_HEADER)
     (sequence_dir / "depth" / "000005.png").unlink()
     Image.new("RGB", (80, 60)).save(sequence_dir / "depth" / "000006.png")
     sequence = RecordedSequence(sequence_dir)
-    for index, fault in ((4, "not a readable image"), (5, "missing"), (6, "one channel")):
+    for index, fault in ((3, "not a readable image"), (4, "not a readable image"), (5, "missing"), (6, "one channel")):
         with pytest.raises(DatasetError, match=f"{index:06d}.*{fault}"):
             sequence[index]
     intrinsics = sequence_dir / "intrinsics.json"
