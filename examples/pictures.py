@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from examples.episode import Episode, base_outline
+from robots.simulation import World
 
 SLICE_HEIGHT = 0.5
 COLOUR_LIMIT = 1.0
@@ -118,11 +119,15 @@ def photo(
         forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
         target = close_up
         eye = target - 0.5 * forward + 1.3 * left + np.array([0.0, 0.0, 0.7])
-    client = episode.world.client
     if "ceiling" in episode.world.solids:
         # Seen through from above; the depth camera, which draws no colours, still sees it.
         ceiling = episode.world.body_id("ceiling")
-        pybullet.changeVisualShape(ceiling, -1, rgbaColor=[1, 1, 1, 0], physicsClientId=client)
+        pybullet.changeVisualShape(ceiling, -1, rgbaColor=[1, 1, 1, 0], physicsClientId=episode.world.client)
+    return photo_from(episode.world, eye, target, width, height)
+
+
+def photo_from(world: World, eye: np.ndarray, target: np.ndarray, width: int, height: int) -> np.ndarray:
+    """What a camera at `eye` that looks at `target` [m] sees: (height, width, 3) uint8."""
     view = pybullet.computeViewMatrix(eye.tolist(), target.tolist(), [0, 0, 1])
     projection = pybullet.computeProjectionMatrixFOV(50, width / height, 0.1, 60)
     shown = pybullet.getCameraImage(
@@ -133,7 +138,7 @@ def photo(
         lightDirection=[2, -3, 6],
         flags=pybullet.ER_NO_SEGMENTATION_MASK,
         renderer=pybullet.ER_TINY_RENDERER,
-        physicsClientId=client,
+        physicsClientId=world.client,
     )
     return np.reshape(shown[2], (height, width, 4))[:, :, :3].astype(np.uint8)
 

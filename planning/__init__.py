@@ -1,7 +1,7 @@
 """Trajectories for robots covered by spheres, through any signed distance field.
 
-The closed-loop base tracker needs casadi and is imported on its own: `from planning.tracking import
-BaseTracker`.
+The closed-loop base tracker and the refinement for wheels need casadi and are imported on their own: `from
+planning.tracking import BaseTracker`, `from planning.refine import Refiner`.
 """
 
 from planning.chomp import Chomp, ChompConfig

@@ -25,8 +25,9 @@ def joint_figure(trajectory: Trajectory, names: Sequence[str] = ()) -> JointFigu
     axes = figure.subplots()
     labels = names or [f"joint {i}" for i in range(trajectory.num_dofs)]
     times, values = trajectory.times.cpu().numpy(), trajectory.waypoints.cpu().numpy()
-    for column, label in zip(values.T, labels, strict=True):
-        axes.plot(times, column, label=label)
+    for i, (column, label) in enumerate(zip(values.T, labels, strict=True)):
+        # matplotlib has ten colours.
+        axes.plot(times, column, "-" if i < 10 else "--", label=label)
     axes.set(xlabel="time [s]", ylabel="joint [rad | m]")
     axes.grid(alpha=0.3)
     axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=8, frameon=False)

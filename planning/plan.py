@@ -97,6 +97,11 @@ class Planner:
             message, nearest = offered(self.robot, line, verdicts[0], sdf, config.chomp.validation, left())
             seconds, first = time.perf_counter() - started, verdicts[0]
             return PlanResult(line, first.status, message, first.clearance, (), 0, seconds, nearest)
+        for line in lines:
+            if line.joint_path_length == 0:
+                stays = check(self.robot, line, sdf, config.chomp.validation)
+                message, seconds = f"start is the goal; {stays.message}", time.perf_counter() - started
+                return PlanResult(line, stays.status, message, stays.clearance, (), 0, seconds)
         guesses = [self._warm(warm_start, line) for line in lines]
         chomp = Chomp(self.robot, config.chomp, self.seed)
         unaided = None

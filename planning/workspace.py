@@ -127,7 +127,7 @@ class Workspace:
                 cost = cost.masked_fill(exempt, 0.0)
                 gradient = gradient.masked_fill(exempt.unsqueeze(-1), 0.0)
         else:
-            clearance, gradient = self._clearance_and_gradient(centres, radii)
+            clearance, gradient = self.clearance_and_gradient(centres, radii)
             cost, slope = hinge_cost(clearance, self.eps)
             gradient = slope.unsqueeze(-1) * gradient
         unknown = self.unknown(centres)
@@ -135,7 +135,7 @@ class Workspace:
             cost = torch.where(unknown, cost.clamp_min(0.5 * self.eps), cost)
         return cost, gradient
 
-    def _clearance_and_gradient(
+    def clearance_and_gradient(
         self, centres: Float[Tensor, "*batch s 3"], radii: Float[Tensor, " s"]
     ) -> tuple[Float[Tensor, "*batch s"], Float[Tensor, "*batch s 3"]]:
         """Clearances, and gradients of the field where they are below eps."""

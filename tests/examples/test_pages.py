@@ -22,6 +22,7 @@ from examples import (
     e07_live_source,
     e08_navigate,
     e09_grasp,
+    e10_whole_body,
 )
 from isdf.datasets import SequenceWriter
 from planning.drive import DriveStatus
@@ -57,9 +58,9 @@ def assert_shows_something(path: Path) -> None:
         assert min(picture.size) > 250 and np.asarray(picture.convert("L")).std() > 6
 
 
-def test_there_are_nine_on_a_page_each_and_their_commands_are_their_own() -> None:
+def test_there_are_ten_on_a_page_each_and_their_commands_are_their_own() -> None:
     pages = sorted((ROOT / "examples").glob("e[0-9][0-9]_*.py"))
-    assert [int(page.name[1:3]) for page in pages] == list(range(1, 10))
+    assert [int(page.name[1:3]) for page in pages] == list(range(1, 11))
     for page in pages:
         text = page.read_text()
         assert 50 <= len(text.splitlines()) <= 130, page.name
@@ -158,3 +159,13 @@ def test_09_lifts(tmp_path, capsys) -> None:
     (tmp_path / "hall.urdf").write_text('<robot name="hall"><link name="floor"/></robot>')
     with pytest.raises(SystemExit, match="no object to grasp"):
         e09_grasp.main(e09_grasp.LiftObject(tmp_path, str(tmp_path / "hall.urdf")))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["default", "truth"])
+def test_10_drives_and_reaches_on_wheels(tmp_path, capsys, method) -> None:
+    assert e10_whole_body.main(e10_whole_body.WholeBody(tmp_path, method=method))
+    said = capsys.readouterr().out
+    assert "in the true scene: success" in said and "contacts none" in said
+    for name in ("joints.png", "way.png", "strip.png"):
+        assert_shows_something(tmp_path / name)

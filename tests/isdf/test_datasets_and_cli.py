@@ -77,7 +77,12 @@ def test_broken_sequences_name_the_file_and_the_fault(sequence_dir) -> None:
     (sequence_dir / "depth" / "000005.png").unlink()
     Image.new("RGB", (80, 60)).save(sequence_dir / "depth" / "000006.png")
     sequence = RecordedSequence(sequence_dir)
-    for index, fault in ((3, "not a readable image"), (4, "not a readable image"), (5, "missing"), (6, "one channel")):
+    for index, fault in (
+        (3, "not a readable image"),
+        (4, "not a readable image"),
+        (5, "missing"),
+        (6, "one channel"),
+    ):
         with pytest.raises(DatasetError, match=f"{index:06d}.*{fault}"):
             sequence[index]
     intrinsics = sequence_dir / "intrinsics.json"

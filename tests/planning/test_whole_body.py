@@ -17,8 +17,10 @@ from planning import (
     Solid,
     Trajectory,
     check,
+    retime,
     rrt_connect,
 )
+from planning.refine import Refiner
 
 robots = pytest.importorskip("robots")
 
@@ -79,3 +81,35 @@ def test_replanning_from_the_last_plan_is_quick_and_stays_near_it(tiago, ends, p
     assert again.success and again.iterations <= 20, again.message
     there = again.trajectory.waypoints[:, None, :2] - last.trajectory.waypoints[None, :, :2]
     assert float(there.norm(dim=-1).amin(dim=1).max()) < 0.2
+
+
+def test_a_robot_that_is_there_already_stays(tiago, ends):
+    start, goal = ends
+    result = Planner(tiago).plan(start, torch.stack([goal, start]), FLAT)
+    assert result.success and result.trajectory.joint_path_length == 0, result.message
+    limits = tiago.velocity_limits.double()
+    assert retime(result.trajectory, limits, limits).duration > 0
+
+
+def test_the_plan_is_made_one_that_wheels_can_follow(tiago, ends, planned):
+    plan = planned[1].trajectory
+    accelerations = torch.tensor([0.6, 0.6, 1.5] + [2.0] * 8, dtype=torch.float64)
+    result = Refiner(tiago, accelerations).refine(plan, FLAT)
+    assert result.success and result.clearance > 0.015, result.message
+    q, h = result.trajectory.waypoints, float(result.trajectory.times[1])
+    heading = (q[1:, 2] + q[:-1, 2]) / 2
+    step, wheel = q.diff(dim=0), torch.stack([heading.cos(), heading.sin()], dim=1)
+    across = step[:, 0] * wheel[:, 1] - step[:, 1] * wheel[:, 0]
+    assert float(across.abs().max()) < 1e-7 < 1e-3 < float(sideways(plan.waypoints.double()))
+    speed = torch.cat([(step[:, :2] * wheel).sum(dim=1, keepdim=True), step[:, 2:]], dim=1) / h
+    joints = [0, *range(2, 11)]
+    assert (speed.abs() <= tiago.velocity_limits.double()[joints] * (1 + 1e-6)).all()
+    assert (speed.diff(dim=0).abs() <= accelerations[joints] * h * (1 + 1e-6)).all()
+    torch.testing.assert_close(q[[0, -1], :2], plan.waypoints[[0, -1], :2].double())
+    torch.testing.assert_close(q[[0, -1], 3:], plan.waypoints[[0, -1], 3:].double())
+
+
+def sideways(q):
+    """Largest slide [m] of the base across its heading in one step."""
+    heading, step = (q[1:, 2] + q[:-1, 2]) / 2, q.diff(dim=0)
+    return (step[:, 0] * heading.sin() - step[:, 1] * heading.cos()).abs().max()
