@@ -17,8 +17,10 @@ from .values import Patches, Window, cells_to_refine, coarse_values, refined_val
 
 # Surfaces this far outside a window still count in it [m].
 MARGIN = 2.5
-# Box about the camera in which distances are guessed: half its sides across and along the vertical [m].
+# Box about the camera in which distances are guessed: half its sides across and along the vertical [m], and at most so
+# many nodes, so that the network of a fine lattice takes no more memory and time than that of the default one.
 GUESS_ACROSS, GUESS_ALONG = 4.48, 2.56
+NODES_ACROSS, NODES_ALONG = 28, 16
 # Radius of the patch of surface about a seed [voxels]: closes the gaps between the seeds of neighbouring voxels.
 PATCH = 0.5
 
@@ -45,8 +47,8 @@ def guess(
         The box [m] that is to be refreshed, or None where there was nothing to go by.
     """
     vertical = int(np.abs(up).argmax())
-    reach = np.full(3, GUESS_ACROSS)
-    reach[vertical] = GUESS_ALONG
+    reach = np.full(3, min(GUESS_ACROSS, NODES_ACROSS * lattice.spacing))
+    reach[vertical] = min(GUESS_ALONG, NODES_ALONG * lattice.spacing)
     begin, end = lattice.window(eye - reach, eye + reach)
     end = begin + (end - begin) // STRIDE * STRIDE
     seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))

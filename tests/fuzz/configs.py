@@ -70,7 +70,7 @@ def any_config_maps(data: st.DataObject, kind: type) -> None:
         elif kind is KinectFusionConfig:
             config = dataclasses.replace(KinectFusionConfig(voxel=0.25, max_voxels=200_000), **changed)
         elif kind is MapperConfig:
-            config = MapperConfig(**changed)
+            config = dataclasses.replace(MapperConfig(max_bricks=200_000), **changed)
         elif kind is IsdfConfig:
             config = dataclasses.replace(TINY, **changed)
         else:

@@ -23,6 +23,7 @@ from isdf import (
 from isdf.cli import main
 from isdf.datasets import SequenceWriter
 from isdf.evaluation import roc_area
+from isdf.mapping import refresh
 from isdf.mapping.completion import CHANNELS, load_network
 from isdf.mapping.evidence import gather
 from isdf.mapping.nearest import nearest_points
@@ -268,6 +269,17 @@ def test_the_network_can_only_share_out_the_gap():
     share, width = load_network()(torch.randn(1, CHANNELS, 16, 16, 8))
     assert share.shape == width.shape == (1, 16, 16, 8)
     assert bool(((share >= 0) & (share <= 1)).all()) and torch.isfinite(width).all()
+
+
+def test_the_network_of_a_fine_map_sees_no_more_nodes(monkeypatch):
+    """A voxel four times as fine would else take it 64 times the memory."""
+    nodes = []
+    run = refresh._run
+    monkeypatch.setattr(refresh, "_run", lambda network, x: nodes.append(x[0].numel()) or run(network, x))
+    for voxel in (0.04, 0.02, 0.01):
+        mapper = Mapper(MapperConfig(voxel=voxel))
+        mapper.integrate(furnished_orbit(16)[0])
+    assert len(nodes) >= 3 and max(nodes) <= 57 * 57 * 33, nodes
 
 
 def test_turned_worlds_give_the_same_map():
