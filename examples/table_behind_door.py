@@ -15,14 +15,17 @@ from robots.inverse_kinematics import solve
 from robots.simulation import Box, DepthCamera, DepthNoise, Scene, World
 from robots.simulation.poses import planar_pose
 
-WALLS = tuple(Box(f"wall_{side}", planar_pose(1.5, side * 1.75, 1.0), (0.1, 2.5, 2.0)) for side in (-1, 1))
-TABLE = Box("table", planar_pose(4.0, 0.6, 0.72), (0.8, 1.4, 0.05))
+WHITE, WOOD, GREY = (0.9, 0.88, 0.84), (0.7, 0.5, 0.3), (0.55, 0.55, 0.58)
+WALLS = tuple(
+    Box(f"wall_{side}", planar_pose(1.5, side * 1.75, 1.0), (0.1, 2.5, 2.0), colour=WHITE) for side in (-1, 1)
+)
+TABLE = Box("table", planar_pose(4.0, 0.6, 0.72), (0.8, 1.4, 0.05), colour=WOOD)
 LEGS = tuple(
-    Box(f"leg_{x}_{y}", planar_pose(4 + 0.3 * x, 0.6 + 0.6 * y, 0.35), (0.06, 0.06, 0.7))
+    Box(f"leg_{x}_{y}", planar_pose(4 + 0.3 * x, 0.6 + 0.6 * y, 0.35), (0.06, 0.06, 0.7), colour=WOOD)
     for x in (-1, 1)
     for y in (-1, 1)
 )
-FLOOR = Box("floor", planar_pose(2.5, 0.0, -0.05), (14.0, 12.0, 0.1))
+FLOOR = Box("floor", planar_pose(2.5, 0.0, -0.05), (14.0, 12.0, 0.1), colour=GREY)
 PLACE = Scene("table behind a door", (FLOOR, *WALLS, TABLE, *LEGS))
 TARGET = torch.tensor([4.25, 0.75, 1.0])  # of the hand, which points down [m]
 EYES = ((0.0, 0.0), (0.0, 1.5), (0.0, -1.5), (2.4, -0.9), (2.4, 2.1), (5.4, 0.6), (4.0, -1.2), (4.0, 2.4))
