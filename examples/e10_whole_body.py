@@ -22,7 +22,7 @@ import planning
 import robots
 from examples.maps import Method
 from examples.pictures import photo_from
-from examples.table_behind_door import PLACE, TARGET, mapped, reaching
+from examples.table_behind_door import PLACE, REGION, TARGET, mapped, reaching
 from planning.refine import RefineConfig, Refiner
 from planning.unicycle_mpc import UnicycleMpc
 from robots.simulation import Recording, World
@@ -72,7 +72,8 @@ def main(options: WholeBody) -> bool:
     start, validation = robot.named["tucked"], planning.ValidationConfig(margin=options.margin)
     with World(PLACE) as world:
         sdf = mapped(world, options.method, options.seed)
-        config = planning.PlannerConfig(chomp=planning.ChompConfig(validation=validation))
+        search = planning.RrtConfig(margin=options.margin + 0.005, min_margin=options.margin)
+        config = planning.PlannerConfig(chomp=planning.ChompConfig(validation=validation), rrt=search)
         plan = planning.Planner(robot, config, options.seed).plan(
             start, reaching(robot, sdf, validation), sdf
         )
@@ -94,7 +95,7 @@ def main(options: WholeBody) -> bool:
 
     options.out.mkdir(parents=True, exist_ok=True)
     motion.trajectory.plot(robot.joint_names).savefig(options.out / "joints.png")
-    figure = isdf.plot_slice(sdf, 0.73, bounds=torch.tensor([[-1.5, -2.5, 0.0], [6.5, 3.5, 1.5]]))
+    figure = isdf.plot_slice(sdf, 0.73, bounds=REGION)
     for path, colour in ((plan.trajectory.waypoints.numpy(), "green"), (recording.base_poses(), "red")):
         figure.axes[0].plot(path[:, 0], path[:, 1], color=colour)
     figure.axes[0].plot(*TARGET[:2].tolist(), "*", color="gold", markersize=14, markeredgecolor="black")

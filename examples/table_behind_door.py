@@ -28,6 +28,7 @@ LEGS = tuple(
 FLOOR = Box("floor", planar_pose(2.5, 0.0, -0.05), (14.0, 12.0, 0.1), colour=GREY)
 PLACE = Scene("table behind a door", (FLOOR, *WALLS, TABLE, *LEGS))
 TARGET = torch.tensor([4.25, 0.75, 1.0])  # of the hand, which points down [m]
+REGION = torch.tensor([[-1.5, -2.5, -0.2], [6.5, 3.5, 1.8]])  # [m]
 EYES = ((0.0, 0.0), (0.0, 1.5), (0.0, -1.5), (2.4, -0.9), (2.4, 2.1), (5.4, 0.6), (4.0, -1.2), (4.0, 2.4))
 
 

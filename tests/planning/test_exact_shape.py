@@ -95,6 +95,34 @@ def test_states_are_measured_as_by_brute_force(panda):
     assert 0 < sum(c >= 0 and g >= 0 for c, g in zip(clearances, gaps, strict=True)) < len(q)
 
 
+FLOOR = Solid("box", (8, 8, 0.1), (0, 0, -0.05))
+KERB, STEP = Solid("box", (0.1, 3, 0.06), (0.8, 0, 0.03)), Solid("box", (3, 3, 0.15), (2.3, 0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("solids", "x", "is_free"),
+    [
+        ((FLOOR,), 0.8, True),
+        ((FLOOR, KERB), 0.8, False),
+        ((FLOOR, KERB), 0.0, True),
+        ((FLOOR, STEP), 0.8, False),
+    ],
+    ids=["on the floor", "over a kerb", "before the kerb", "in a step"],
+)
+def test_wheels_may_touch_the_floor_and_nothing_else(solids, x, is_free):
+    """The compiled rule for the floor, which decides alone where robot and field can be compiled."""
+    field, tiago = PrimitiveField(list(solids)), robots.load("tiago")
+    q = tiago.named["tucked"].double()
+    q[0] = x
+    shape = exact_shape(tiago, field)
+    assert shape is not None and tiago.floor_spheres.any()
+    from planning.compiled.states import free
+
+    depth = float(shape.measure(q[None], 0.0, 0.0)[0][0])
+    assert free(shape.world, q.numpy()) == (depth >= 0) == is_free, depth
+    assert check(tiago, Trajectory(q[None], torch.zeros(1)), field).success == is_free
+
+
 def test_the_search_finds_a_checked_path_and_repeats(panda):
     start = panda.named["ready"].double()
     goal = start.clone()
