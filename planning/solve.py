@@ -38,8 +38,8 @@ class PosableRobot(SphereRobot, Protocol):
 def _planner() -> PlannerConfig:
     # Goals are a few millimetres from the shelves they stand on, so all margins are small.
     # The fine cover protrudes by 1.5 mm, so half a millimetre within it is still clear of the
-    # robot itself, and so are two covers that overlap by 3 mm of each other.
-    validation = ValidationConfig(max_joint_step=0.01, margin=-0.0005, self_margin=-0.003)
+    # robot itself, and so are two covers that overlap by as much as one protrudes.
+    validation = ValidationConfig(max_joint_step=0.01, margin=-0.0005, self_margin=-0.0015)
     return PlannerConfig(
         num_waypoints=40,
         spacing=0.15,
@@ -60,7 +60,7 @@ def _planner() -> PlannerConfig:
             shortcut_rounds=400,
             seconds=5.0,
             candidates=6,
-            self_margin=-0.003,
+            self_margin=-0.0015,
         ),
     )
 
