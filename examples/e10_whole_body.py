@@ -52,7 +52,7 @@ def carried_out(
     world.add_robot(robot.urdf_path, robot.joint_names, motion.waypoints[0].numpy())
     recording, command, photos = Recording(world), np.zeros(2), list[np.ndarray]()
     times = np.arange(0.0, motion.duration + 1.0, PERIOD)
-    for t in times:
+    for i, t in enumerate(times):
         ahead = motion.at(float(t) + PERIOD * torch.arange(HORIZON + 1)).numpy()
         solved = wheels.solve(world.robot_state()[0][:3], command, ahead[1:, :3].T)
         command = np.zeros(2) if solved is None else solved
@@ -60,7 +60,7 @@ def carried_out(
         world.command_joints(ahead[1], (ahead[1] - ahead[0]) / PERIOD)
         world.step(PERIOD)
         recording.add()
-        if len(photos) < 4 and t >= times[-1] * len(photos) / 3:
+        if 3 * i >= len(photos) * (len(times) - 1):
             photos.append(photo_from(world, np.array([2.2, -3.8, 3.4]), np.array([2.4, 0.2, 0.5]), 400, 300))
     return recording, photos
 

@@ -169,3 +169,4 @@ def test_10_drives_and_reaches_on_wheels(tmp_path, capsys, method) -> None:
     assert "in the true scene: success" in said and "contacts none" in said
     for name in ("joints.png", "way.png", "strip.png"):
         assert_shows_something(tmp_path / name)
+    assert Image.open(tmp_path / "strip.png").size == (1600, 300), "from the start to the goal in four photos"
