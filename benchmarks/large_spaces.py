@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 
 from isdf import DepthFrame, Mapper, PinholeCamera
 from isdf.evaluation.figures import save_small
+from robots.simulation.poses import looking
 from robots.simulation.ray_casting import RayCaster
 
 HOUSE = Path("aws_small_house") / "small_house_visual_world.ply"
@@ -135,10 +136,7 @@ def mapped(name: str, rays: RayCaster, spots: Float[np.ndarray, "n 3"]) -> list[
 def view(rays: RayCaster, spot: Float[np.ndarray, "3"], yaw: float, when: float) -> DepthFrame | None:
     """The depth image of a camera that looks along `yaw` and a little down; None where it sees nothing."""
     forward = np.array([np.cos(yaw) * np.cos(PITCH), np.sin(yaw) * np.cos(PITCH), -np.sin(PITCH)])
-    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = spot
+    T = looking(spot, forward)
     v, u = torch.meshgrid(torch.arange(CAMERA.height), torch.arange(CAMERA.width), indexing="ij")
     directions = CAMERA.rays(torch.stack([u, v], dim=-1)).double().view(-1, 3).numpy() @ T[:3, :3].T
     depth = rays.cast(spot, directions).reshape(CAMERA.height, CAMERA.width)

@@ -25,7 +25,7 @@ from isdf.mapping.evidence import gather
 from isdf.mapping.seeds import surface_seeds
 from isdf.sampling import RayBatch
 from robots.simulation import Box, DepthCamera, PinholeCamera, SceneField, World, make_scene
-from robots.simulation.poses import planar_pose
+from robots.simulation.poses import looking, planar_pose
 
 FOLDER = Path(__file__).parent / "images" / "concepts"
 DISTANCES = {"cmap": "coolwarm_r", "vmin": -1.5, "vmax": 1.5}
@@ -207,13 +207,7 @@ def looked_at(world: World, eye: tuple[float, float, float], headings: np.ndarra
     camera = DepthCamera(world, PinholeCamera.from_fov(160, 120, 1.2))
     frames = []
     for i, heading in enumerate(headings):
-        forward = np.array([np.cos(heading), np.sin(heading), -0.35])
-        forward /= np.linalg.norm(forward)
-        right = np.array([np.sin(heading), -np.cos(heading), 0.0])
-        T = np.eye(4)
-        T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-        T[:3, 3] = eye
-        camera.T_link_camera = T
+        camera.T_link_camera = looking(eye, (np.cos(heading), np.sin(heading), -0.35))
         frame = camera.render()
         frames.append(isdf.DepthFrame(frame.depth, frame.T_world_camera, frame.camera, 0.1 * i))
     return frames

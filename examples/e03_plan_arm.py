@@ -20,7 +20,7 @@ import isdf
 import planning
 import robots
 from robots.simulation import Box, DepthCamera, DepthNoise, Scene, World
-from robots.simulation.poses import planar_pose
+from robots.simulation.poses import looking, planar_pose
 
 TABLE = Box("table", planar_pose(0.75, 0.0, 0.06), (0.8, 1.4, 0.1))
 PILLAR = Box("pillar", planar_pose(0.45, 0.0, 0.41), (0.1, 0.1, 0.6))
@@ -45,13 +45,7 @@ def camera_pose(angle: float) -> np.ndarray:
     """T_world_camera (4, 4) of a camera 1.9 m from the pillar at an angle [rad], looking at it; OpenCV axes."""
     target = np.array([0.5, 0.0, 0.3])
     eye = target + np.array([1.9 * math.cos(angle), 1.9 * math.sin(angle), 0.7])
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = eye
-    return T
+    return looking(eye, target - eye)
 
 
 def mapped(world: World, options: PlanArm) -> isdf.Mapper:

@@ -77,12 +77,16 @@ def main(options: WholeBody) -> bool:
         plan = planning.Planner(robot, config, options.seed).plan(
             start, reaching(robot, sdf, validation), sdf
         )
+        print(f"plan: {plan}")
+        if not plan.success:
+            print(plan.message)
+            return False
         accelerations = torch.tensor([0.6, 0.6, 1.5] + [2.0] * (robot.num_dofs - 3))
         refine = RefineConfig(margin=options.margin + 0.01, validation=validation)
         motion = Refiner(robot, accelerations, refine).refine(plan.trajectory, sdf)
-        print(f"plan: {plan}\non wheels: {motion}")
-        if not (plan.success and motion.success):
-            print(f"{plan.message}; {motion.message}")
+        print(f"on wheels: {motion}")
+        if not motion.success:
+            print(motion.message)
             return False
         recording, photos = carried_out(world, robot, motion.trajectory)
         last = torch.as_tensor(world.robot_state()[0], dtype=torch.float32)

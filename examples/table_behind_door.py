@@ -13,7 +13,7 @@ import robots
 from examples.maps import Method, new_map
 from robots.inverse_kinematics import solve
 from robots.simulation import Box, DepthCamera, DepthNoise, Scene, World
-from robots.simulation.poses import planar_pose
+from robots.simulation.poses import looking, planar_pose
 
 WHITE, WOOD, GREY = (0.9, 0.88, 0.84), (0.7, 0.5, 0.3), (0.55, 0.55, 0.58)
 WALLS = tuple(
@@ -38,10 +38,7 @@ def mapped(world: World, method: Method, seed: int) -> planning.DistanceField:
     noise, rng = DepthNoise(), np.random.default_rng(seed)
     for number, (x, y) in enumerate(EYES):
         for yaw in np.arange(8) * math.pi / 4:
-            T = np.eye(4)
-            forward = np.array([math.cos(yaw), math.sin(yaw), -0.4]) / math.hypot(1.0, 0.4)
-            right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
-            T[:3] = np.c_[right, np.cross(forward, right), forward, (x, y, 1.4)]
+            T = looking((x, y, 1.4), (math.cos(yaw), math.sin(yaw), -0.4))
             frame = DepthCamera(world, T_link_camera=T).render()
             depth = noise(frame.depth, rng)
             mapper.integrate(isdf.DepthFrame(depth, frame.T_world_camera, frame.camera, number + yaw / 10))

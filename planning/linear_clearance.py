@@ -122,10 +122,9 @@ class ClearanceModel:
         """Gaps [m] of the pairs, and directions from their second sphere to their first."""
         first, second = self._pairs.unbind(dim=1)
         apart = centres[:, first] - centres[:, second]
-        distance = apart.norm(dim=-1)
-        return distance - self._radii[first] - self._radii[second], apart / distance.clamp_min(1e-9)[
-            ..., None
-        ]
+        distance = apart.norm(dim=-1, keepdim=True)
+        touching = self._radii[first] + self._radii[second]
+        return distance.squeeze(-1) - touching, apart / distance.clamp_min(1e-9)
 
 
 def _least(room: Float[Tensor, "n m"], count: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:

@@ -6,7 +6,7 @@ last motion and kept within a trust region, while the rule of the wheels, the li
 
 from __future__ import annotations
 
-import logging
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from planning.drive_path import driveable
+from planning.ends import check_ends
 from planning.errors import ConfigError
 from planning.linear_clearance import ClearanceModel
 from planning.protocols import CostField, DistanceField, SphereRobot
@@ -24,9 +25,7 @@ from planning.result import PlanResult, Status
 from planning.timing import UNLIMITED, retime
 from planning.trajectory import Trajectory
 from planning.transcription import DriveLimits, Iterate, Transcription
-from planning.validation import ValidationConfig, check, check_dofs
-
-logger = logging.getLogger(__name__)
+from planning.validation import ValidationConfig, check
 
 
 @dataclass(frozen=True)
@@ -67,14 +66,16 @@ class RefineConfig:
             raise ConfigError(
                 f"RefineConfig: base_joints must name x, y and yaw, or be empty, got {self.base_joints}."
             )
-        if self.segment_time <= 0 or not 3 <= self.fewest <= self.most:
+        if not self.segment_time > 0 or not 3 <= self.fewest <= self.most:
             raise ConfigError(
                 "RefineConfig: segment_time must be positive and 3 <= fewest <= most, got "
                 f"{self.segment_time:g} s, {self.fewest} and {self.most}."
             )
-        if min(self.reverse_speed, self.margin, self.self_margin, self.smoothness) < 0 or self.radius <= 0:
+        not_negative = (self.reverse_speed, self.margin, self.self_margin, self.smoothness, self.improvement)
+        if not all(value >= 0 for value in not_negative) or not self.radius > 0 or self.iterations < 1:
             raise ConfigError(
-                "RefineConfig: reverse_speed, margins and smoothness must not be negative, radius positive."
+                "RefineConfig: reverse_speed, margins, smoothness and improvement must not be negative, radius and "
+                f"iterations must be positive, got {self}."
             )
 
 
@@ -135,10 +136,11 @@ class Refiner:
         Raises:
             TrajectoryError: if the trajectory does not fit the robot.
         """
-        check_dofs(self.robot, trajectory)
         started, best = time.perf_counter(), None
-        path = trajectory.waypoints.double().numpy()
-        config = self.config
+        path, config = trajectory.waypoints.double().numpy(), self.config
+        ends = check_ends(self.robot, trajectory, sdf, config.validation)
+        if not ends.success:
+            return _unrefined(trajectory, ends.status, ends.message, ends.clearance, started)
         clearances = ClearanceModel(
             self.robot, sdf, path[[0, -1]], config.margin, config.self_margin, config.validation.workspace
         )
@@ -148,8 +150,10 @@ class Refiner:
                 return result
             best = best or result
         if best is None:
-            text = "no motion keeps the limits and the rule of the wheels near the path"
-            return PlanResult(trajectory, Status.NO_PATH, text, np.nan, (), 0, time.perf_counter() - started)
+            given = check(self.robot, trajectory, sdf, config.validation)
+            status = Status.NO_PATH if given.success else given.status
+            text = f"no motion keeps the limits and the rule of the wheels near the path; {given.message}"
+            return _unrefined(trajectory, status, text, given.clearance, started)
         return best
 
     def _guesses(self, path: Float[np.ndarray, "n dof"]) -> list[Iterate]:
@@ -191,21 +195,21 @@ class Refiner:
         programme, model = self._programme(len(motion.driven)), clearances.at(motion.q)
         for _ in range(config.iterations):
             step = programme.solve(motion, model, radius)
-            there = None if step is None else clearances.at(step.q)
-            gained = -np.inf
-            if step is not None and there is not None:
+            if step is not None:
+                there = clearances.at(step.q)
                 cost = programme.cost(step, motion.step) + SLACK_COST * there.violation
-                # The guess breaks limits, so the first programme's motion is taken as it is.
                 gained = programme.cost(motion, motion.step) + SLACK_COST * model.violation - cost
-                gained = gained if history else np.inf
-            if step is None or there is None or gained <= 0:
+                # The guess breaks limits, so the first programme's motion is taken as it is, unless the field is NaN.
+                better = gained > 0 if history else math.isfinite(cost)
+            if step is None or not better:
                 radius /= 4
                 if radius < SMALLEST_RADIUS:
                     break
                 continue
+            done = bool(history) and gained < config.improvement * cost and there.violation < SHORTFALL
             motion, model, radius = step, there, 1.5 * radius
             history.append(cost)
-            if gained < config.improvement * cost and model.violation < SHORTFALL:
+            if done:
                 break
         return self._checked(motion, sdf, tuple(history), started) if history else None
 
@@ -226,6 +230,12 @@ class Refiner:
         return PlanResult(
             trajectory, verdict.status, verdict.message, verdict.clearance, history, len(history), seconds
         )
+
+
+def _unrefined(
+    trajectory: Trajectory, status: Status, message: str, clearance: float, started: float
+) -> PlanResult:
+    return PlanResult(trajectory, status, message, clearance, (), 0, time.perf_counter() - started)
 
 
 def _columns(robot: SphereRobot, names: Sequence[str]) -> list[int]:

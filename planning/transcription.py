@@ -105,9 +105,8 @@ class Transcription:
             (driven + limits.reverse * step, 0.0, np.inf),
             (casadi.vertcat(*cleared), 0.0, np.inf),
         )
-        before = casadi.SX.sym(
-            "h0"
-        )  # smoothness is measured in the last iterate's time, which keeps it convex
+        # Smoothness is measured in the last iterate's time, which keeps it convex.
+        before = casadi.SX.sym("h0")
         effort = casadi.sumsqr(changes / (scale * before**2)) * before
         cost = segments * step + smoothness * effort + slack_cost * casadi.sum1(slack)
         programme = {
@@ -123,13 +122,15 @@ class Transcription:
         )
 
     def solve(self, last: Iterate, clearances: Clearances, radius: float) -> Iterate | None:
-        """The best motion within a trust region about the last one; None where the solver fails.
+        """The best motion within a trust region about the last one; None where the solver fails or a clearance is NaN.
 
         Args:
             last: start and goal are taken from it.
             clearances: linearised at it.
             radius: most that a joint may move away from it [rad | m].
         """
+        if np.isnan(clearances.gap).any():
+            return None
         limits, n, dof = self._limits, self._segments + 1, last.q.shape[1]
         low, high = np.maximum(limits.lower, last.q - radius), np.minimum(limits.upper, last.q + radius)
         for end in (0, -1):

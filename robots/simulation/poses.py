@@ -18,6 +18,16 @@ def planar_pose(x: float | int, y: float | int, z: float | int = 0.0, yaw: float
     return pose
 
 
+def looking(eye: Sequence[float] | np.ndarray, forward: Sequence[float] | np.ndarray) -> np.ndarray:
+    """T_world_camera (4, 4) of a level camera at `eye` [m] that looks along `forward`; OpenCV axes."""
+    ahead = np.asarray(forward, dtype=np.float64) / np.linalg.norm(forward)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.c_[right, np.cross(ahead, right), ahead, eye]
+    return pose
+
+
 def pose_matrix(position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
     """Pose (4, 4) from a position [m] and a quaternion (x, y, z, w)."""
     pose = np.eye(4)

@@ -11,6 +11,7 @@ from planning.drive_path import driveable
 from planning.linear_clearance import ClearanceModel
 from planning.refine import RefineConfig, Refiner
 from planning.workspace import WorkspaceConfig
+from tests.planning.fields import AutogradField
 from tests.planning.robots import Base, PlanarArm
 
 FLOOR = Solid("box", (20, 20, 0.1), (0, 0, -0.05))
@@ -94,6 +95,23 @@ def test_a_path_through_a_wall_is_no_success() -> None:
     assert result.status is Status.COLLISION and "inside an obstacle" in result.message
 
 
+@pytest.mark.parametrize("x, status", [(0.0, Status.START_IN_COLLISION), (2.0, Status.GOAL_IN_COLLISION)])
+def test_blocked_ends_are_reported_before_anything_is_solved(x, status) -> None:
+    blocked = PrimitiveField([FLOOR, Solid("box", (0.1, 0.1, 1.0), (x, 0.0, 0.5))])
+    result = Refiner(Base(), ACCELERATIONS).refine(to(2.0, 0.0, 0.0), blocked)
+    assert result.status is status and result.iterations == 0
+
+
+@pytest.mark.parametrize("end", [2.0, 9.0], ids=["between the ends", "to the goal"])
+def test_a_field_without_numbers_is_said_to_be_one(end) -> None:
+    class Hole(AutogradField):
+        def distance(self, points):
+            return torch.where((points[..., 0] > 1.0) & (points[..., 0] < end), torch.nan, points[..., 2])
+
+    result = Refiner(Base(), ACCELERATIONS).refine(to(3.0, 0.0, 0.0), Hole())
+    assert result.status is Status.INVALID_FIELD and "NaN" in result.message
+
+
 def test_an_arm_without_wheels_is_timed_and_kept_clear() -> None:
     arm = PlanarArm((0.5, 0.4, 0.3))
     post = PrimitiveField([Solid("cylinder", (2.0, 0.05), (0.75, 0.75, 0.5))])
@@ -133,5 +151,7 @@ def test_what_does_not_fit_is_named() -> None:
         RefineConfig(base_joints=("base_x",))
     with pytest.raises(ConfigError, match="fewest <= most"):
         RefineConfig(fewest=50, most=40)
+    with pytest.raises(ConfigError, match="must not be negative"):
+        RefineConfig(margin=math.nan)
     with pytest.raises(TrajectoryError, match="2 joints a waypoint"):
         Refiner(Base(), ACCELERATIONS).refine(Trajectory.line(torch.zeros(2), torch.ones(2)), FREE)
