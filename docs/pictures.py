@@ -223,11 +223,13 @@ def draw_map(out: Path) -> None:
         mapper.refresh()
         truth = world.field().distance(points).numpy()
     field, lattice, bricks = mapper.field(), mapper.lattice, mapper.bricks
-    upper_corner = lattice.spacing * (lattice.corner + np.array(lattice.shape))
+    shape = np.array(lattice.shape)
+    upper_corner = lattice.spacing * (lattice.corner + shape)
     seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(lattice.spacing * lattice.corner, upper_corner))
-    proven = gather(seeds, lattice.evidence, lattice.corner, lattice.spacing)
+    evidence = lattice.read("evidence", np.zeros_like(shape), shape)
+    proven = gather(seeds, evidence, lattice.corner, lattice.spacing)
     nodes = np.rint(points.numpy() / lattice.spacing).astype(int) - lattice.corner
-    nodes = tuple(np.moveaxis(np.clip(nodes, 0, np.array(lattice.shape) - 1), -1, 0))
+    nodes = tuple(np.moveaxis(np.clip(nodes, 0, shape - 1), -1, 0))
     panels = {
         "upper bound: closest surface seen": proven.upper[nodes],
         "lower bound: closest place not looked at": proven.lower[nodes],

@@ -185,3 +185,12 @@ LINKS = [
 @pytest.mark.parametrize(("page", "link"), LINKS, ids=[f"{p.stem}-{n}" for p, n in LINKS])
 def test_every_local_link_and_picture_exists(page, link) -> None:
     assert (page.parent / link).exists()
+
+
+def test_the_pictures_of_the_concepts_are_drawn_by_the_code_of_today(tmp_path) -> None:
+    """By their own command: drawing sets the number of threads of its whole process."""
+    run = [sys.executable, "-m", "docs.pictures", "--out", str(tmp_path)]
+    done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    shown = {path.name for path in (ROOT / "docs/images/concepts").iterdir()}
+    assert {path.name for path in tmp_path.iterdir()} == shown
