@@ -91,7 +91,8 @@ def test_baking_is_exact_at_grid_points_and_close_between() -> None:
     points = torch.rand(2000, 3) * 2 - 1
     off_centre = BallField.distance(points) > -0.3
     error = (field.distance(points) - BallField.distance(points)).abs()[off_centre]
-    assert error.max() < 0.012
+    curvature = 2 / 0.2  # [1/m] the sum of the second derivatives where it is greatest, 20 cm from the centre
+    assert error.max() < 1.05 * 0.1**2 / 8 * curvature
     fine = bake(BallField(), BallField.bounds, 0.05, padding=0.3)
     assert (fine.distance(points) - BallField.distance(points)).abs()[off_centre].max() < 0.5 * error.max()
 
