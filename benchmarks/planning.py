@@ -12,6 +12,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import sys
 import time
 from collections import Counter
 from dataclasses import dataclass, field
@@ -21,6 +22,9 @@ from typing import Any, Literal
 import matplotlib
 import numpy as np
 import tyro
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import robots
 from benchmarks.planning_check import CheckedRobot, Checker

@@ -18,6 +18,7 @@ Then the default map's figures beside their targets, and its CPU time a frame by
 from __future__ import annotations
 
 import json
+import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,9 @@ import numpy as np
 import torch
 import tyro
 from torch import Tensor
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.realtime_report import Reliability, save_reliability, target_lines
 from benchmarks.stages import map_stages

@@ -10,6 +10,7 @@ and the true distances there. No room of `robots.simulation.scenes` takes part.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ import numpy as np
 import torch
 import tyro
 from safetensors.torch import load_file, save_file
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.random_rooms import RandomRoom, depth_image, random_room, scene_distance
 from isdf.mapping.completion import CompletionNet, features

@@ -13,12 +13,17 @@ Leaves map.safetensors and slice.png.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 import tyro
 from tqdm import tqdm
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import isdf
 from examples.episode import Episode, EpisodeOptions

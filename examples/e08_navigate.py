@@ -7,12 +7,17 @@ Leaves states.npz and way.png. `examples.navigate` is the same with a report, a 
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
 from tqdm import tqdm
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import isdf
 from examples.episode import Episode, EpisodeOptions

@@ -9,11 +9,16 @@ the table, and writes a report.
 from __future__ import annotations
 
 import dataclasses
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import isdf
 from examples.arm import Grasp, execute, grasp_candidates, parked, plan_reach, within_limits

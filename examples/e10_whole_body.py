@@ -9,6 +9,7 @@ it out. Leaves joints.png, way.png and strip.png.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,9 @@ import numpy as np
 import torch
 import tyro
 from PIL import Image
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import isdf
 import planning

@@ -9,13 +9,18 @@ Success and contacts are read from the physics.
 from __future__ import annotations
 
 import dataclasses
+import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
 from tqdm import tqdm
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from examples.episode import Episode, EpisodeOptions
 from examples.pictures import Film, save_map_picture

@@ -8,11 +8,16 @@ Writes the recorded-sequence folder (depth/, poses.txt, intrinsics.json) that `i
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 import tyro
 from tqdm import tqdm
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from examples.camera_tour import CameraTour, Leg
 from examples.episode import Episode, EpisodeOptions

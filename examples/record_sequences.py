@@ -10,6 +10,7 @@ depth, and `truth.json` the exact solids. What is finished is not recorded again
 from __future__ import annotations
 
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,9 @@ import numpy as np
 import torch
 import tyro
 from tqdm import tqdm
+
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from examples.camera_tour import CameraTour
 from examples.episode import Episode, EpisodeOptions

@@ -200,6 +200,24 @@ def test_compiled_code_is_kept_between_runs_and_lets_other_threads_run(package: 
     assert careless(ast.parse(text)) == [1, 5, 7]
 
 
+def runs_as_a_file(tree: ast.Module) -> bool:
+    """Whether a script finds its neighbours when Python is given its path instead of -m and its name."""
+    path_set = False
+    for node in when_loaded(tree):
+        path_set |= isinstance(node, ast.If) and ast.unparse(node.test) == "not __package__"
+        needed = {name.partition(".")[0] for name in imported([node], "script", False, set())}
+        if needed & set(OUTSIDE) and not path_set:
+            return False
+    return True
+
+
+@pytest.mark.parametrize("folder", ["examples", "benchmarks"])
+def test_scripts_run_as_files(folder: str) -> None:
+    scripts = {n: t for n, p in sources(ROOT, folder).items() if "__main__" in (t := p.read_text())}
+    assert len(scripts) > 5
+    assert not [name for name, text in scripts.items() if not runs_as_a_file(ast.parse(text))]
+
+
 def test_the_checks_see_what_they_look_for(tmp_path) -> None:
     files = {
         "isdf/__init__.py": "from .a import f\n",
