@@ -27,16 +27,13 @@ if not __package__:  # run as a file
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import robots
-from benchmarks.planning_check import CheckedRobot, Checker
+from benchmarks.planning_check import Checker, checked_robot
 from benchmarks.planning_rivals import PLANNERS, Planner
 from planning.problems import Problem, load_problems
 from planning.solve import SolveConfig
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-
-# Of a base that stands on the floor only what its wheels touch would collide.
-IGNORED = {"panda": frozenset[str](), "fetch": frozenset({"base_link"})}
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,7 @@ class Planning:
     data: Path = field(default_factory=lambda: Path(os.environ.get("ISDF_DATA_DIR", "../shared/data")))
     """Folder with motionbenchmaker/ROBOT_problems.json.gz."""
     robots: tuple[Literal["panda", "fetch"], ...] = ("panda",)
-    planners: tuple[Literal["ours", "ompl", "vamp"], ...] = ("ours", "ompl", "vamp")
+    planners: tuple[Literal["ours", "ompl", "vamp", "tesseract"], ...] = ("ours", "ompl", "vamp", "tesseract")
     limit: int = 50
     """Problems of each set."""
     deadline: float = 10.0
@@ -69,7 +66,7 @@ class Planning:
         raw = json.loads(gzip.decompress(path.read_bytes()))["problems"]
         problems = load_problems(path)
         robot, done = robots.load(robot_name), {key(r) for r in read(self.out / "results.jsonl")}
-        checker, planners = checker_of(robot_name, robot), self._installed(robot_name, robot)
+        checker, planners = Checker(checked_robot(robot_name, robot)), self._installed(robot_name, robot)
         warm = set()
         with (self.out / "results.jsonl").open("a") as lines:
             for problem, entry in zip(problems, raw, strict=True):
@@ -94,14 +91,6 @@ class Planning:
             except ImportError as error:
                 print(f"{name} is left out: {error}")
         return found
-
-
-def checker_of(name: str, robot: robots.Robot) -> Checker:
-    """The independent checker of a ready-made robot."""
-    allowed = robot.sphere_set.ignored_pairs | robot.tree.neighbours(tuple(robot.sphere_set.spheres))
-    tool = robot.tool_link
-    assert tool is not None
-    return Checker(CheckedRobot(robot.urdf_path, tool, frozenset(allowed), IGNORED[name]))
 
 
 def measured(

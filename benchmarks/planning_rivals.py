@@ -1,4 +1,4 @@
-"""Planners to compare with, each on one problem at a time: this project's, OMPL's and VAMP's.
+"""Planners to compare with, each on one problem at a time: this project's, OMPL's, VAMP's and Tesseract's.
 
 The others are optional: a planner whose package is missing is left out, with a word on it.
 """
@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from planning import SphereRobot
+from benchmarks.planning_check import checked_robot
 from planning.exact_shape import exact_shape
 from planning.problems import Problem
 from planning.solve import Solver
+from robots import Robot
 
 OMPL_RESOLUTION = 0.001  # of the space's extent, between two states that OMPL tests on an edge
 
@@ -32,7 +33,7 @@ class Answer:
 Planner = Callable[[Problem, float], Answer]
 
 
-def ours(robot_name: str, robot: SphereRobot) -> Planner:
+def ours(robot_name: str, robot: Robot) -> Planner:
     """Search, CHOMP and check, as `python -m planning solve` runs them."""
     solver = Solver(robot)
 
@@ -43,7 +44,7 @@ def ours(robot_name: str, robot: SphereRobot) -> Planner:
     return plan
 
 
-def ompl(robot_name: str, robot: SphereRobot) -> Planner:
+def ompl(robot_name: str, robot: Robot) -> Planner:
     """OMPL's RRT-Connect with its path simplifier; it asks our compiled collision test, through Python."""
     from ompl import base, geometric, util
 
@@ -87,7 +88,7 @@ def ompl(robot_name: str, robot: SphereRobot) -> Planner:
     return plan
 
 
-def vamp(robot_name: str, robot: SphereRobot) -> Planner:
+def vamp(robot_name: str, robot: Robot) -> Planner:
     """VAMP's vectorised RRT-Connect and simplifier, on its own spheres and compiled robot."""
     import vamp
     from scipy.spatial.transform import Rotation
@@ -116,4 +117,27 @@ def vamp(robot_name: str, robot: SphereRobot) -> Planner:
     return plan
 
 
-PLANNERS: Mapping[str, Callable[[str, SphereRobot], Planner]] = {"ours": ours, "ompl": ompl, "vamp": vamp}
+def tesseract(robot_name: str, robot: Robot) -> Planner:
+    """Tesseract's TrajOpt, on the collision meshes, from one seed after the other."""
+    from benchmarks.tesseract_rival import trajopt_solver
+
+    checked = checked_robot(robot_name, robot)
+    solvers: dict[tuple[str, ...], Any] = {}
+
+    def plan(problem: Problem, deadline: float) -> Answer:
+        if problem.joints not in solvers:
+            order = [robot.joint_names.index(name) for name in problem.joints]
+            limits = robot.joint_limits[order].numpy()
+            solvers[problem.joints] = trajopt_solver(checked, problem.joints, limits)
+        found = solvers[problem.joints](problem, deadline)
+        return Answer(found, [], "success" if found else "no path")
+
+    return plan
+
+
+PLANNERS: Mapping[str, Callable[[str, Robot], Planner]] = {
+    "ours": ours,
+    "ompl": ompl,
+    "vamp": vamp,
+    "tesseract": tesseract,
+}

@@ -10,8 +10,10 @@ import torch
 
 import robots
 from benchmarks import planning as benchmark
+from benchmarks.planning_check import Checker, checked_robot
 from benchmarks.planning_rivals import PLANNERS, Answer
 from planning import Trajectory, retime
+from planning.problems import load_problems
 
 READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 
@@ -23,7 +25,7 @@ def panda():
 
 @pytest.fixture(scope="module")
 def checker(panda):
-    return benchmark.checker_of("panda", panda)
+    return Checker(checked_robot("panda", panda))
 
 
 def _entry(panda, goal=0.6, box=(0.1, 0.1, 0.1), at=(-0.7, 0.0, 0.2)):
@@ -96,3 +98,18 @@ def test_a_run_goes_on_where_it_ended(panda, tmp_path, monkeypatch):
     text = (tmp_path / "out" / "table.md").read_text()
     assert "3 problems, 1 of which are infeasible" in text and "| ours | 2/2 |" in text
     assert (tmp_path / "out" / "success.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize("name", ["ompl", "tesseract"])
+def test_rivals_solve_what_the_checker_passes(name, panda, checker, tmp_path):
+    """Each with an obstacle beside the straight line, then with one that the hand has to pass over."""
+    pytest.importorskip({"tesseract": "tesseract_robotics"}.get(name, name))
+    plan = PLANNERS[name]("panda", panda)
+    x, y = 0.31 * np.cos(0.3), 0.31 * np.sin(0.3)
+    for entry in (_entry(panda), _entry(panda, box=(0.05, 0.05, 0.2), at=(x, y, 0.4))):
+        path = tmp_path / "problems.json"
+        path.write_text(json.dumps({"problems": [entry]}))
+        answer = plan(load_problems(path)[0], 5.0)
+        assert answer.status == "success"
+        assert checker.judge(entry, answer.waypoints) == "ok"
+    assert checker.judge(entry, _line(entry)) != "ok"
