@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,10 @@ from torch import Tensor
 import planning
 import robots
 from examples.disturbances import DisturbedRobot
+from planning.grasping import Grasps, ParallelHand
 from planning.protocols import DistanceField
 from planning.workspace import Workspace
+from robots.fine_cover import fine_cover
 from robots.inverse_kinematics import solve
 from robots.simulation import SimulatedMobileRobot
 
@@ -21,6 +23,9 @@ BASE = ("base_x", "base_y", "base_yaw")
 CONTROL_PERIOD = 0.02
 # The share of the URDF's speed limits the arm uses, and its accelerations [rad/s^2 | m/s^2].
 SPEED_SHARE, ACCELERATION = 0.4, 1.0
+HAND = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
+ARM_ROOM = 0.005
+"""Of arm and torso on the straight lines [m]; the hand's is judged in the finer map."""
 
 
 @dataclass(frozen=True)
@@ -31,57 +36,66 @@ class Grasp:
     """(k, dof), from the pre-grasp posture to the grasp."""
     lift: Tensor
     """(k, dof), from the grasp upwards."""
-    clearance: float
-    """Of the pre-grasp posture in the map [m]."""
+    score: float
+    """What it was ranked by."""
 
 
-def grasp_candidates(
+def open_hand(model: robots.Robot) -> ParallelHand:
+    """The hand with its fingers open, covered by fine balls."""
+    assert model.gripper is not None and model.tool_link is not None
+    cover = fine_cover(model.urdf_path)
+    links = [link for link in cover if link in HAND]
+    tool, *poses = model.link_poses(model.rest, [model.tool_link, *links])
+    centres, radii = [], []
+    for link, pose in zip(links, poses, strict=True):
+        balls = torch.as_tensor(cover[link], dtype=torch.float32)
+        T = torch.linalg.inv(tool) @ pose
+        centres.append(balls[:, :3] @ T[:3, :3].T + T[:3, 3])
+        radii.append(balls[:, 3])
+    at, size = torch.cat(centres), torch.cat(radii)
+    opening = 2 * (model.gripper.open_position[0] - model.gripper.closed_position[0])
+    return ParallelHand(at, size, opening, float((at[:, 2] + size).max()))
+
+
+def reachable_grasps(
     model: robots.Robot,
     q: Tensor,
-    target: np.ndarray,
-    yaw: float,
+    grasps: Grasps,
     field: DistanceField,
-    retreat: float = 0.13,
+    retreat: float = 0.12,
     rise: float = 0.14,
     seed: int = 0,
-) -> list[Grasp]:
-    """Grasps of an upright object from the robot's side, those with the most room before them first.
+) -> Iterator[Grasp]:
+    """Of ranked grasps those that the arm reaches along a straight line and lifts from, without touching anything.
 
     Args:
         model: the parked robot: only the arm's and the torso's joints.
         q: its posture now (dof,).
-        target: where the middle of the fingers should close [m].
-        yaw: heading of the base; the hand comes from about there.
+        grasps: the best first.
         field: the map.
-        retreat: how far before the target the straight approach begins [m].
+        retreat: how far before the grasp the straight approach begins [m].
         rise: how far the object is lifted [m].
         seed: of the inverse kinematics.
     """
-    found = []
-    for pitch, turn in itertools.product((0.3, 0.15, 0.5), (0.0, 0.3, -0.3)):
-        tool = tool_pose(target, yaw + turn, pitch)
-        before = tool.clone()
-        before[:3, 3] -= retreat * tool[:3, 2]
-        ends = solve(model, before, q, num_seeds=48, seed=seed)
-        if not bool(ends.converged[0]):
-            continue
-        approach = straight_line(model, ends.q[0], before, tool)
-        above = tool.clone()
-        above[2, 3] += rise
-        lift = None if approach is None else straight_line(model, approach[-1], tool, above)
-        if approach is not None and lift is not None:
-            found.append(Grasp(approach, lift, clearance(model, ends.q, field)))
-    return sorted(found, key=lambda g: -min(g.clearance, 0.06))
-
-
-def tool_pose(position: np.ndarray, yaw: float, pitch: float) -> Tensor:
-    """(4, 4) pose of a tool at a point, its z axis (the fingers) along yaw and down by pitch [rad], y level."""
-    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
-    left = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-    T = np.eye(4)
-    T[:3, :3] = np.stack([np.cross(left, forward), left, forward], axis=1)
-    T[:3, 3] = position
-    return torch.as_tensor(T, dtype=torch.float32)
+    arm = torch.tensor([link not in HAND for link in model.sphere_links])
+    for block in torch.arange(len(grasps)).split(8):
+        tools = grasps.T_world_tool[block]
+        before = tools.clone()
+        before[:, :3, 3] -= retreat * tools[:, :3, 2]
+        ends = solve(model, before, q, num_seeds=32, seed=seed)
+        for i in range(len(block)):
+            if not bool(ends.converged[i]):
+                continue
+            approach = straight_line(model, ends.q[i], before[i], tools[i])
+            if approach is None:
+                continue
+            above = tools[i].clone()
+            above[2, 3] += rise
+            lift = straight_line(model, approach[-1], tools[i], above)
+            if lift is None or clearance(model, torch.cat([approach, lift]), field, arm) < ARM_ROOM:
+                continue
+            if clearance(model, ends.q[i : i + 1], field) > 0:
+                yield Grasp(approach, lift, float(grasps.score[block[i]]))
 
 
 def straight_line(
@@ -99,10 +113,12 @@ def straight_line(
     return torch.stack(postures)
 
 
-def clearance(model: robots.Robot, q: Tensor, field: DistanceField) -> float:
-    """Least clearance [m] of postures q (n, dof) in a field, the floor under the base left out."""
+def clearance(
+    model: robots.Robot, q: Tensor, field: DistanceField, spheres: Tensor | slice = slice(None)
+) -> float:
+    """Least clearance [m] of postures q (n, dof) in a field, or of some spheres; the floor under the base left out."""
     workspace = Workspace(model, field, eps=1.0)
-    return float(workspace.clearance(*model.spheres(q)).amin())
+    return float(workspace.clearance(*model.spheres(q))[:, spheres].amin())
 
 
 def plan_reach(

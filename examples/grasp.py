@@ -1,9 +1,10 @@
-"""A mobile manipulator drives up to a table, maps it, reaches through the map, and lifts an object off it.
+"""A mobile manipulator drives up to an object that somebody points at, maps it, and lifts it off its table.
 
     python -m examples.grasp --out runs/grasp --scene apartment --seed 0
 
-The object's place is given, as a detector would; the room is not. Leaves report.html, report.json, states.npz (every
-executed step), map.png, map.safetensors and episode.gif. Success is read from the physics: lifted 10 cm, held for 2 s.
+Given is a point on the object, as a click in the camera's image gives it; neither its shape and pose nor the room is.
+Leaves report.html, report.json, states.npz (every executed step), map.png, map.safetensors and episode.gif. Success is
+read from the physics: lifted 10 cm, held for 2 s.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import dataclasses
 import math
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,19 +25,19 @@ from tqdm import tqdm
 if not __package__:  # run as a file
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import isdf
-from examples.arm import Grasp, execute, grasp_candidates, parked, plan_reach, within_limits
+from examples.arm import Grasp
 from examples.episode import Episode, EpisodeOptions, chosen_scene
+from examples.grasp_stages import HELD_FOR, LIFTED, choose_grasp, close_look, take
+from examples.parking import parking_places
 from examples.pictures import Film, save_map_picture
+from examples.pointing import click_on
 from examples.report import write_report
 from planning.drive import DriveReport
 from planning.replanning import ReplanningConfig, ReplanningLoop
 from robots.simulation import GraspTask, Scene, SceneField
 
-LIFTED, HELD_FOR = 0.10, 2.0
-GRIP_FORCE = 20.0
-# Above the middle of the object [m], so that the hand stays clear of the table.
-GRIP_HEIGHT = 0.025
+PLACES = 3
+"""The robot tries at most so many places to park."""
 
 
 @dataclass(frozen=True)
@@ -46,123 +48,117 @@ class GraspOptions(EpisodeOptions):
     """How far from its parking place the robot starts, about [m]."""
     margin: float = 0.02
     """Clearance the arm keeps in the map where start and goal allow it [m]."""
+    looks: int = 12
+    """Depth images of the object from close by."""
     film: bool = True
     """Make the GIF; it takes about half a minute."""
 
 
 class GraspEpisode:
-    """The stages of one episode; `run` goes through them and says where it ended."""
+    """The stages of one episode; `run` goes through them and says where it ended.
 
-    def __init__(self, options: GraspOptions) -> None:
+    Args:
+        options: see `GraspOptions`.
+        scene: with a grasp task; the one that the options name if None.
+        start: base pose x, y [m], yaw [rad]; some way before the task's parking place if None.
+    """
+
+    def __init__(
+        self,
+        options: GraspOptions,
+        scene: Scene | None = None,
+        start: tuple[float, float, float] | None = None,
+    ) -> None:
         self.options = options
-        scene = chosen_scene(options)
+        scene = scene or chosen_scene(options)
         if scene.grasp is None:
             raise SystemExit(f"{options.scene} has no object to grasp; choose apartment, office or flat")
         self.task: GraspTask = scene.grasp
-        self.episode = Episode(options, start_before(scene, self.task, options.distance, options.seed))
+        start = start or start_before(scene, self.task, options.distance, options.seed)
+        self.episode = Episode(options, start, scene=scene)
+        self.episode.robot.wait(1.0)  # until things have come to rest
+        self.point = click_on(
+            self.episode.world, self.task.object_name, np.array([*self.task.park[:2], 1.2]), options.seed
+        )
         self.clock = options.clock()
         self.drive: DriveReport | None = None
+        self.reason = ""
         self.planning_seconds = 0.0
         self.lift_height = 0.0
-        self.film = Film(self.episode, np.array(self.task.park), 0.7 if options.film else np.inf)
-        self.bar = tqdm(desc="approaching", unit=" s", disable=None, bar_format="{desc}: {elapsed}")
+        self.film = Film(self.episode, self.point, 0.7 if options.film else np.inf)
+        self.bar = tqdm(desc="looking around", unit=" s", disable=None, bar_format="{desc}: {elapsed}")
 
     def run(self) -> str:
         """Returns "success" or the stage that failed."""
-        if not self.approach():
-            return "approach"
-        self.bar.set_description("mapping the table")
-        self.film.close_up = self.episode.world.object_pose(self.task.object_name)[:3, 3]
-        self.map_table()
-        self.bar.set_description("planning the reach")
-        grasp, reach = self.plan()
-        if grasp is None or reach is None:
-            return "planning"
-        self.bar.set_description("grasping")
-        self.take(grasp, reach)
-        return "success" if self.lift_height >= LIFTED else "lift"
+        self.go(self.episode.robot.base_state(), scan=2 * math.pi)
+        ended, tried = "approach", 0
+        self.reason = "no place to park in reach of the point"
+        for place in self.places():
+            if tried == PLACES:
+                break
+            tried += 1
+            self.bar.set_description("approaching")
+            if not self.go(np.array(place)):
+                assert self.drive is not None
+                self.reason = self.drive.message
+                continue
+            self.bar.set_description("looking closely and planning the reach")
+            chosen = self.plan()
+            if isinstance(chosen, str):
+                ended, self.reason = "planning", chosen
+                continue
+            self.bar.set_description("grasping")
+            self.film.close_up = self.point
+            name = self.task.object_name
+            self.lift_height = take(self.episode, *chosen, name, self.film.add)
+            self.reason = ""
+            return "success" if self.lift_height >= LIFTED else "lift"
+        return ended
 
-    def approach(self) -> bool:
-        """Drive to the parking place, turned to the table."""
+    def places(self) -> Iterator[tuple[float, float, float]]:
+        """Places to park, each by the newest map and away from the earlier ones."""
+        earlier: list[tuple[float, float, float]] = []
+        while True:
+            found = parking_places(
+                self.episode.body,
+                self.episode.field_for_driving(),
+                self.point,
+                self.episode.robot.base_state(),
+            )
+            apart = [p for p in found if all(math.dist(p[:2], e[:2]) > 0.25 for e in earlier)]
+            if not apart:
+                return
+            earlier.append(apart[0])
+            yield apart[0]
+
+    def go(self, place: np.ndarray, scan: float = 0.0) -> bool:
+        """Drive to a place (x, y [m], yaw [rad]), after a turn of `scan` [rad]."""
         episode = self.episode
         loop = ReplanningLoop(
             episode.robot,
             episode.body,
             episode.mapper,
             episode.field_for_driving,
-            ReplanningConfig(scan=2 * math.pi, time_limit=120.0),
+            ReplanningConfig(scan=scan, time_limit=60.0),
             self.clock,
             lambda loop: self.film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy()),
             self.options.seed,
             episode.monitor,
         )
-        self.drive = loop.drive_to(np.array(self.task.park[:2]), final_yaw=self.task.park[2])
-        return self.drive.success
+        report = loop.drive_to(place[:2], final_yaw=float(place[2]))
+        self.drive = report if self.drive is None else self.drive.joined(report)
+        return report.success
 
-    def map_table(self, seconds: float = 8.0) -> None:
-        """Look over the table and its object while the map trains, for about so long [s of the robot's time]."""
-        episode, middle = self.episode, self.episode.world.object_pose(self.task.object_name)[:3, 3]
-        side = np.array([-np.sin(self.task.park[2]), np.cos(self.task.park[2]), 0.0])
-        ends = episode.robot.time + seconds
-        offsets = (0.0, 0.3, -0.3, 0.0, 0.5, -0.5)
-        turn = 0
-        while episode.robot.time < ends:
-            episode.robot.look_at(middle + offsets[turn % len(offsets)] * side)
-            turn += 1
-            episode.robot.wait(0.3)
-            episode.mapper.integrate(episode.robot.observe())
-            episode.robot.wait(self.clock.train(episode.mapper) + self.clock.train(episode.mapper))
-            self.film.add()
-
-    def plan(self) -> tuple[Grasp | None, torch.Tensor | None]:
-        """Choose a grasp and plan the way to where its straight approach begins."""
-        episode = self.episode
-        model, q = parked(episode.model, episode.robot.posture())
-        q = within_limits(model, q)
-        middle = episode.world.object_pose(self.task.object_name)[:3, 3]
-
-        def search() -> tuple[Grasp | None, torch.Tensor | None]:
-            field = self.field_for_reaching()
-            yaw = float(episode.robot.base_state()[2])
-            target = middle + np.array([0.0, 0.0, GRIP_HEIGHT])
-            for grasp in grasp_candidates(model, q, target, yaw, field, seed=self.options.seed)[:4]:
-                result = plan_reach(
-                    model, q, grasp.approach[0], field, self.options.margin, self.options.seed
-                )
-                if result.success:
-                    return grasp, result.trajectory.waypoints
-            return None, None
-
-        found, spent = self.clock.charge(search)
-        self.planning_seconds = spent
-        episode.robot.wait(spent)
+    def plan(self) -> tuple[Grasp, torch.Tensor] | str:
+        """Look closely, then choose a grasp and the way to it; or say why there is none."""
+        options, robot = self.options, self.episode.robot
+        close = close_look(self.episode, self.point, options.looks, self.clock, self.film.add)
+        found, spent = self.clock.charge(
+            lambda: choose_grasp(self.episode, close, self.point, options.margin, options.seed)
+        )
+        self.planning_seconds += spent
+        robot.wait(spent)
         return found
-
-    def field_for_reaching(self):
-        """The map round the robot and the table, baked finely."""
-        x, y, _ = self.episode.robot.base_state()
-        bounds = torch.tensor([[x - 1.1, y - 1.1, 0.0], [x + 1.1, y + 1.1, 1.6]])
-        return isdf.bake(self.episode.mapper.field(), bounds, 0.03)
-
-    def take(self, grasp: Grasp, reach: torch.Tensor) -> None:
-        """Reach, approach, close, lift and hold."""
-        robot = self.episode.robot
-        model, _ = parked(self.episode.model, robot.posture())
-        before = robot.world.object_pose(self.task.object_name)[2, 3]
-        robot.world.command_gripper(1.0)
-        for waypoints, speed in ((reach, 1.0), (grasp.approach, 0.4)):
-            execute(robot, model, waypoints, speed)
-            self.film.add()
-        robot.world.command_gripper(0.0, GRIP_FORCE)
-        robot.wait(1.0)
-        execute(robot, model, grasp.lift, 0.4)
-        self.film.add()
-        heights = []
-        for _ in range(round(HELD_FOR / 0.1)):
-            robot.wait(0.1)
-            heights.append(robot.world.object_pose(self.task.object_name)[2, 3] - before)
-            self.film.add()
-        self.lift_height = float(min(heights))
 
 
 def start_before(scene: Scene, task: GraspTask, distance: float, seed: int) -> tuple[float, float, float]:
@@ -201,6 +197,7 @@ def main(options: GraspOptions) -> dict:
         "seed": options.seed,
         "success": ended == "success",
         "ended": ended,
+        "reason": grasping.reason,
         "lift_height": grasping.lift_height,
         "held_seconds": HELD_FOR if ended == "success" else 0.0,
         "contacts": len(contacts),
@@ -214,7 +211,7 @@ def main(options: GraspOptions) -> dict:
     options.out.mkdir(parents=True, exist_ok=True)
     episode.robot.recording.save(options.out / "states.npz")
     episode.save_map(options.out / "map.safetensors")
-    save_map_picture(options.out / "map.png", episode, np.array(grasping.task.park))
+    save_map_picture(options.out / "map.png", episode, grasping.point)
     if options.film:
         grasping.film.save(options.out / "episode.gif")
     write_report(options.out, report, headline(report))
@@ -227,7 +224,7 @@ def headline(report: dict) -> str:
     if report["success"]:
         verdict = f"Lifted the object {100 * report['lift_height']:.0f} cm and held it {report['held_seconds']:.0f} s"
     else:
-        verdict = f"Failed at: {report['ended']}"
+        verdict = f"Failed at: {report['ended']}{report['reason'] and ' (' + report['reason'] + ')'}"
     return f"{verdict}, {report['contacts']} contacts with anything else, {report['robot_seconds']:.0f} s in all."
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
@@ -77,6 +77,17 @@ class DriveReport:
     def success(self) -> bool:
         """True if the goal was reached."""
         return self.status is DriveStatus.REACHED
+
+    def joined(self, later: DriveReport) -> DriveReport:
+        """This drive and a later one as one: it ended as the later one did."""
+        sums = (
+            "duration", "path_length", "rounds", "plans", "failed_plans", "frames", "frames_refused",
+            "mapping_seconds", "planning_seconds", "slowed", "stopped", "blind",
+        )  # fmt: skip
+        events = [*self.events, *later.events][:MOST_EVENTS]
+        slowest = max(self.slowest_plan, later.slowest_plan)
+        added = {name: getattr(self, name) + getattr(later, name) for name in sums}
+        return replace(later, slowest_plan=slowest, events=events, **added)
 
     def note(self, time: float, event: str) -> None:
         """Add an event at a time [s] of the drive."""

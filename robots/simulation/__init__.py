@@ -13,6 +13,7 @@ from robots.simulation.scene_sdf import SceneField
 from robots.simulation.scenes import Scene, available_scenes, load_urdf_scene, make_scene
 from robots.simulation.simulated_robot import MotorConfig, SimulatedRobot
 from robots.simulation.truth import Truth, load_truth, save_truth
+from robots.simulation.urdf_object import UrdfObject, load_object
 from robots.simulation.world import World
 
 __all__ = [
@@ -37,8 +38,10 @@ __all__ = [
     "SimulatedRobot",
     "Sphere",
     "Truth",
+    "UrdfObject",
     "World",
     "available_scenes",
+    "load_object",
     "load_truth",
     "load_urdf_scene",
     "make_scene",

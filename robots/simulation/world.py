@@ -19,6 +19,7 @@ from robots.simulation.primitives import Box, Cylinder, Primitive
 from robots.simulation.scene_sdf import SceneField
 from robots.simulation.scenes import Scene
 from robots.simulation.simulated_robot import GripperModel, MotorConfig, SimulatedRobot
+from robots.simulation.urdf_object import UrdfObject
 
 
 class World:
@@ -219,12 +220,13 @@ class World:
         del self._bodies[name], self._solids[name], self._names[body]
 
     def field(self) -> SceneField:
-        """Ground-truth distance field of the solids where they are now, without the robot.
+        """Ground-truth distance field of the solids where they are now, without the robot and objects of meshes.
 
         Raises:
             SceneError: if the world has no solids.
         """
-        return SceneField(solid.at(self.object_pose(name)) for name, solid in self._solids.items())
+        solids = self._solids.items()
+        return SceneField(s.at(self.object_pose(name)) for name, s in solids if not isinstance(s, UrdfObject))
 
     def body_id(self, name: str) -> int:
         """Return pybullet's id of a solid, for what the world has no method for.
@@ -279,6 +281,11 @@ def _link_names(client: int, body: int) -> dict[int, str]:
 
 def _create_body(client: int, solid: Primitive) -> int:
     """Make a pybullet body of a solid and return its id."""
+    if isinstance(solid, UrdfObject):
+        body = pybullet.loadURDF(str(solid.urdf_path), physicsClientId=client)
+        # Loading places the link's frame, this its centre of mass.
+        pybullet.resetBasePositionAndOrientation(body, *split_pose(solid.pose), physicsClientId=client)
+        return body
     if isinstance(solid, Box):
         shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": list(solid.parameters)}
         drawn = shape
