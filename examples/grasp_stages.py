@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ GRIP_FORCE = 30.0
 """[N]"""
 LIFTED, HELD_FOR = 0.10, 2.0
 """What counts as lifted [m], and for how long it is held [s]."""
-CLOSE = isdf.MapperConfig(voxel=0.01, truncation=0.031, max_depth=1.6)
+CLOSE = isdf.MapperConfig(voxel=0.01, truncation=0.031)
 """The map of the object alone: fingers need it finer than wheels do."""
 NEAR = 0.3
 """What is farther from the object than this [m] is left out of its map."""
@@ -51,11 +52,11 @@ def close_look(
         episode.robot.look_at(before[number] if number < len(before) else close)
         episode.robot.wait(0.3)
         frame = episode.robot.observe()
-        if frame is None:
+        if frame is None or not frame.depth.any():
             continue
-        _, spent = clock.charge(
-            lambda frame=frame: (episode.mapper.integrate(frame), mapper.integrate(only_near(frame, point)))
-        )
+        near = only_near(frame, point)
+        views = [(episode.mapper, frame), *([(mapper, near)] if near.depth.any() else [])]
+        spent = sum(clock.charge(partial(taking.integrate, view))[1] for taking, view in views)
         episode.robot.wait(spent + clock.train(episode.mapper))
         watch()
     return mapper.field()

@@ -13,6 +13,7 @@ from planning.errors import ConfigError
 from planning.grid_search import GridSearchConfig, Route, grid_search
 from planning.protocols import DistanceField, SphereRobot
 from planning.result import PlanResult
+from planning.threads import one_thread
 from planning.trajectory import Trajectory
 from planning.validation import check
 
@@ -103,6 +104,7 @@ class BasePlanner:
         """Forget the dead ends, for another goal."""
         self._entries = []
 
+    @one_thread
     def plan(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField) -> BasePlan:
         """Plan from start to goal [m]; a dead end is remembered."""
         route = self.route(start, goal, sdf)

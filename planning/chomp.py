@@ -22,6 +22,7 @@ from planning.metric import Metric, MetricConfig
 from planning.objective import Objective, ObjectiveConfig
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
+from planning.threads import one_thread
 from planning.trajectory import Trajectory
 from planning.validation import Validation, ValidationConfig, check
 from planning.workspace import Workspace
@@ -81,6 +82,7 @@ class Chomp:
     def __init__(self, robot: SphereRobot, config: ChompConfig | None = None, seed: int = 0) -> None:
         self.robot, self.config, self.seed = robot, config or ChompConfig(), seed
 
+    @one_thread
     def optimise(
         self,
         trajectory: Trajectory | Sequence[Trajectory],

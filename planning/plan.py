@@ -18,6 +18,7 @@ from planning.exact_shape import exact_shape
 from planning.initialise import NoPath, RrtConfig, rrt_connect
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
+from planning.threads import one_thread
 from planning.trajectory import Trajectory
 from planning.validation import check
 
@@ -61,6 +62,7 @@ class Planner:
     def __init__(self, robot: SphereRobot, config: PlannerConfig | None = None, seed: int = 0) -> None:
         self.robot, self.config, self.seed = robot, config or PlannerConfig(), seed
 
+    @one_thread
     def plan(
         self,
         start: Float[Tensor, " dof"],

@@ -93,7 +93,7 @@ class SceneField:
     5, ground truth). Conforms to the `DistanceField` protocol. Immutable.
 
     Args:
-        scene: a scene of primitives, or any iterable of primitives.
+        scene: a scene of primitives, or any iterable of primitives; objects of meshes are left out.
 
     Raises:
         SceneError: if there is no primitive to measure from, such as in a scene made of meshes.
@@ -101,7 +101,7 @@ class SceneField:
 
     def __init__(self, scene: Scene | Iterable[Primitive]):
         primitives = scene if isinstance(scene, Iterable) else (*scene.static, *scene.objects)
-        self.primitives: tuple[Primitive, ...] = tuple(primitives)
+        self.primitives: tuple[Primitive, ...] = tuple(p for p in primitives if p.kind in LOCAL_DISTANCE)
         if not self.primitives:
             raise SceneError("a distance field needs at least one primitive; this scene has none")
         self._groups = {dtype: self._stack(dtype) for dtype in (torch.float32, torch.float64)}

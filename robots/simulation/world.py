@@ -225,8 +225,7 @@ class World:
         Raises:
             SceneError: if the world has no solids.
         """
-        solids = self._solids.items()
-        return SceneField(s.at(self.object_pose(name)) for name, s in solids if not isinstance(s, UrdfObject))
+        return SceneField(solid.at(self.object_pose(name)) for name, solid in self._solids.items())
 
     def body_id(self, name: str) -> int:
         """Return pybullet's id of a solid, for what the world has no method for.
