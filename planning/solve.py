@@ -57,7 +57,7 @@ def _planner() -> PlannerConfig:
             margin=0.005,
             reach=0.5,
             resolution=0.04,
-            shortcut_rounds=400,
+            shortcut_rounds=250,
             seconds=5.0,
             candidates=6,
             self_margin=-0.0015,
