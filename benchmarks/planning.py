@@ -181,7 +181,7 @@ def picture(results: list[dict[str, Any]], path: Path) -> None:
             axis.step([*seconds, longest], [*share, *share[-1:]], where="post", label=planner)
         axis.set(xscale="log", xlabel="CPU time of one core [s]", title=robot, ylim=(0, 101))
         axis.grid(alpha=0.3)
-        axis.legend(loc="lower right")
+        axis.legend(loc="upper left")
     axes[0, 0].set_ylabel("feasible problems solved and checked [%]")
     figure.tight_layout()
     figure.savefig(path, dpi=120)
