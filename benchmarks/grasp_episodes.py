@@ -110,11 +110,18 @@ def unwanted(touched: dict[str, float]) -> dict[str, float]:
     return {pair: depth for pair, depth in touched.items() if pair not in wanted}
 
 
+def lost_at(report: dict) -> str:
+    """The stage that an episode without success ended at."""
+    if "error" in report:
+        return "error"
+    return "contact" if report["lifted"] else report["ended"]
+
+
 def summary(reports: list[dict]) -> str:
     """Tables of results by thing and by support, and what became of the episodes that failed."""
     ran = [r for r in reports if "error" not in r]
     lifted, clean = sum(r["lifted"] for r in ran), sum(r["success"] for r in ran)
-    lost = Counter("error" if "error" in r else r["ended"] for r in reports if not r["success"])
+    lost = Counter(lost_at(r) for r in reports if not r["success"])
     stages = ", ".join(f"{stage} {count}" for stage, count in lost.most_common())
     lines = [
         f"{len(reports)} episodes, {lifted} lifted and held, {clean} of these without any other contact. "

@@ -25,7 +25,7 @@ LIFTED, HELD_FOR = 0.10, 2.0
 """What counts as lifted [m], and for how long it is held [s]."""
 CLOSE = isdf.MapperConfig(voxel=0.01, truncation=0.031)
 """The map of the object alone: fingers need it finer than wheels do."""
-NEAR = 0.3
+NEAR = 0.8
 """What is farther from the object than this [m] is left out of its map."""
 SPACING = 0.03
 """Of the baked map that the arm plans in [m]."""

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from planning.errors import ConfigError
 from planning.object_surface import ObjectSurface
-from planning.protocols import DistanceField
+from planning.protocols import ConfidentField, DistanceField
+from planning.threads import one_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,14 @@ class ParallelHand:
     tips: float
 
 
+POINTS = 1200
+"""Of a surface are looked at; more cost time and tell no more."""
+FINGER = 0.04
+"""What lies this near to the tips is a finger [m]."""
+FACE = 0.004
+"""What lies within this of a grasp's widest place is the face that a finger closes on [m]."""
+
+
 @dataclass(frozen=True)
 class GraspConfig:
     """Which grasps are looked for.
@@ -46,20 +55,24 @@ class GraspConfig:
         bites: how deep the fingers reach over the object [m].
         pad: width of a finger's face [m].
         play: least difference between opening and object [m].
-        antipodal: least cosine between the faces' normals and the closing line.
+        antipodal: least mean cosine between a face's normals and the closing line.
+        hold: least share of a finger's pad that touches the object.
         room: least clearance of the open hand [m]; negative by what the map and the balls may be wrong.
+        confidence: where the field knows how sure it is, fingers stay out of space below this: unknown is not free.
         retreat: the hand needs room along its way from this far before the grasp, too [m].
         most: grasps to return.
     """
 
-    headings: int = 24
+    headings: int = 36
     pitches: tuple[float, ...] = (0.0, 0.3, 0.7, 1.1, math.pi / 2)
-    anchors: int = 24
-    bites: tuple[float, ...] = (0.02, 0.035)
+    anchors: int = 48
+    bites: tuple[float, ...] = (0.02, 0.035, 0.05)
     pad: float = 0.02
     play: float = 0.006
-    antipodal: float = 0.7
+    antipodal: float = 0.85
+    hold: float = 0.3
     room: float = -0.003
+    confidence: float = 0.65
     retreat: float = 0.12
     most: int = 40
 
@@ -77,7 +90,7 @@ class Grasps:
     Args:
         T_world_tool: (n, 4, 4) [m].
         width: (n,) of the object between the fingers [m].
-        antipodal: (n,) the lesser cosine between a face's normal and the closing line.
+        antipodal: (n,) the lesser mean cosine between a face's normals and the closing line.
         clearance: (n,) of the open hand [m].
         score: (n,) what they are ranked by.
     """
@@ -96,6 +109,7 @@ class Grasps:
         return Grasps(*(value[rows] for value in vars(self).values()))
 
 
+@one_thread
 def find_grasps(
     field: DistanceField,
     surface: ObjectSurface,
@@ -116,17 +130,21 @@ def find_grasps(
     """
     config = config or GraspConfig()
     generator = torch.Generator().manual_seed(seed)
-    anchors = surface.points[torch.randperm(len(surface.points), generator=generator)[: config.anchors]]
+    drawn = torch.randperm(len(surface.points), generator=generator)[:POINTS]
+    surface = ObjectSurface(surface.points[drawn], surface.normals[drawn], surface.support)
+    anchors = surface.points[: config.anchors]
     found = [
         _along(surface, anchors, turn, hand, bite, config) for turn in _turns(config) for bite in config.bites
     ]
-    T = torch.cat([poses for poses, _, _ in found])
-    width = torch.cat([widths for _, widths, _ in found])
-    antipodal = torch.cat([cosines for _, _, cosines in found])
+    T, width, antipodal, hold = (torch.cat(parts) for parts in zip(*found, strict=True))
     grasps = Grasps(
-        T, width, antipodal, torch.zeros_like(width), _score(T, width, antipodal, surface, hand, heading)
+        T,
+        width,
+        antipodal,
+        torch.zeros_like(width),
+        _score(T, width, antipodal, surface, hand, heading) + 2.0 * hold,
     )
-    good = (width <= hand.opening - config.play) & (antipodal >= config.antipodal)
+    good = (width <= hand.opening - config.play) & (antipodal >= config.antipodal) & (hold >= config.hold)
     return _with_room(field, grasps.take(good), hand, config)
 
 
@@ -148,8 +166,11 @@ def _along(
     hand: ParallelHand,
     bite: float,
     config: GraspConfig,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Poses (k, 4, 4), widths (k,) and cosines (k,) of grasps with one rotation, at every anchor."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Poses (k, 4, 4), widths, cosines and holds (k,) of grasps with one rotation, at every anchor.
+
+    A hold is how much of a pad touches the face, by length and width, on the side that has less: at most 1.
+    """
     local, normals = surface.points @ turn, surface.normals @ turn
     here = anchors @ turn
     slab = (local[None, :, 0] - here[:, None, 0]).abs() <= config.pad / 2
@@ -159,30 +180,45 @@ def _along(
     across = local[:, 1].expand(slab.shape)
     low = across.masked_fill(~window, torch.inf).amin(dim=1)
     high = across.masked_fill(~window, -torch.inf).amax(dim=1)
-    cosines = [
-        facing.expand(slab.shape).masked_fill(~(window & near), -1.0).amax(dim=1)
-        for facing, near in (
-            (normals[:, 1], across >= high[:, None] - 0.006),
-            (-normals[:, 1], across <= low[:, None] + 0.006),
-        )
-    ]
+    cosines, holds = [], []
+    for facing, near in (
+        (normals[:, 1], across >= high[:, None] - FACE),
+        (-normals[:, 1], across <= low[:, None] + FACE),
+    ):
+        face = window & near & (local[None, :, 2] >= front[:, None] + bite - config.pad)
+        cosines.append(_mean(facing.expand(slab.shape), face))
+        holds.append(_extent(local[:, 2], face, config.pad) * _extent(local[:, 0], face, config.pad))
     origin = torch.stack([here[:, 0], (low + high) / 2, front + bite - hand.tips], dim=1)
     T = torch.eye(4).repeat(len(anchors), 1, 1)
     T[:, :3, :3], T[:, :3, 3] = turn, origin @ turn.T
-    return T, high - low, torch.minimum(*cosines)
+    return T, high - low, torch.minimum(*cosines), torch.minimum(*holds)
+
+
+def _mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of each row's values where the mask is set; -1 where it is not at all."""
+    count = mask.sum(dim=1)
+    mean = values.masked_fill(~mask, 0.0).sum(dim=1) / count.clamp_min(1)
+    return mean.where(count > 0, -1.0)
+
+
+def _extent(values: Tensor, mask: Tensor, most: float) -> Tensor:
+    """Range of the values (n,) where each row's mask is set, as a share of `most`, at most 1."""
+    rows = values.expand(mask.shape)
+    extent = rows.masked_fill(~mask, -torch.inf).amax(dim=1) - rows.masked_fill(~mask, torch.inf).amin(dim=1)
+    return (extent / most).clamp(0.0, 1.0)
 
 
 def _score(
     T: Tensor, width: Tensor, antipodal: Tensor, surface: ObjectSurface, hand: ParallelHand, heading: float
 ) -> Float[Tensor, " n"]:
-    """Faces that look away from each other, near the middle, with play for the fingers, from the robot's side."""
+    """Opposite faces count most, then being near the middle, play for the fingers, and the robot's side."""
     low, high = surface.points.amin(dim=0), surface.points.amax(dim=0)
     middle = (low + high) / 2
     away = (T[:, :3, 3] - middle) / (high - low).norm()
     beside = away[:, :2].norm(dim=1) + 0.5 * away[:, 2].abs()
     tight = (width / hand.opening - 0.75).clamp_min(0.0)
     towards = T[:, 0, 2] * math.cos(heading) + T[:, 1, 2] * math.sin(heading)
-    return antipodal - 0.8 * beside - 0.5 * tight + 0.3 * towards
+    return 3.0 * antipodal - 0.8 * beside - 0.5 * tight + 0.3 * towards
 
 
 def _with_room(field: DistanceField, grasps: Grasps, hand: ParallelHand, config: GraspConfig) -> Grasps:
@@ -191,7 +227,7 @@ def _with_room(field: DistanceField, grasps: Grasps, hand: ParallelHand, config:
     grasps = grasps.take(order)
     clearance = hand_clearance(field, grasps.T_world_tool, hand, config.retreat)
     grasps = Grasps(grasps.T_world_tool, grasps.width, grasps.antipodal, clearance, grasps.score)
-    grasps = grasps.take(clearance >= config.room)
+    grasps = grasps.take((clearance >= config.room) & _seen(field, grasps.T_world_tool, hand, config))
     return grasps.take(_different(grasps.T_world_tool, config.most))
 
 
@@ -208,6 +244,18 @@ def hand_clearance(
             gaps = (field.distance(centres) - hand.radii).amin(dim=1)
             clearance[block] = torch.minimum(clearance[block], gaps)
     return clearance
+
+
+def _seen(
+    field: DistanceField, T: Float[Tensor, "n 4 4"], hand: ParallelHand, config: GraspConfig
+) -> Bool[Tensor, " n"]:
+    """Where both fingers are in seen space: behind an object may be more of it. All, if the field cannot tell."""
+    if not isinstance(field, ConfidentField):
+        return torch.ones(len(T), dtype=torch.bool)
+    fingers = hand.centres[hand.centres[:, 2] > -FINGER]
+    known = field.confidence(fingers @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]) >= config.confidence
+    sides = [known[:, side].float().mean(dim=1) for side in (fingers[:, 1] > 0, fingers[:, 1] < 0)]
+    return torch.minimum(*sides) > 0.75
 
 
 def _different(T: Float[Tensor, "n 4 4"], most: int) -> Bool[Tensor, " n"]:

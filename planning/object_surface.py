@@ -12,6 +12,12 @@ from torch import Tensor
 
 from planning.errors import ConfigError, FieldError
 from planning.protocols import ConfidentField, DistanceField
+from planning.threads import one_thread
+
+MOST = 2500
+"""Points on an object; finding out which hang together takes time that grows with their square."""
+LAYER, CELL = 0.008, 0.02
+"""The size of level faces is measured in layers of this height and cells of this width [m]."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +26,7 @@ class SurfaceConfig:
 
     Args:
         radius: nothing farther than this from the point belongs to the object [m].
+        around: the support is looked for up to this far from the point [m], where it is larger than the object's top.
         samples: points that are moved onto the zero level set.
         accuracy: points that stay farther than this from it are dropped [m].
         above: what is lower than this over the support is taken for the support [m].
@@ -27,15 +34,16 @@ class SurfaceConfig:
         confidence: where the field knows how sure it is, surfaces that it only guesses, below this, are left out.
     """
 
-    radius: float = 0.16
-    samples: int = 6000
+    radius: float = 0.2
+    around: float = 0.35
+    samples: int = 8000
     accuracy: float = 0.002
     above: float = 0.009
     gap: float = 0.015
     confidence: float = 0.75
 
     def __post_init__(self) -> None:
-        if not min(self.radius, self.samples, self.accuracy, self.above, self.gap) > 0:
+        if not min(self.radius, self.around, self.samples, self.accuracy, self.above, self.gap) > 0:
             raise ConfigError(f"SurfaceConfig: all values must be positive, got {self}.")
 
 
@@ -54,6 +62,7 @@ class ObjectSurface:
     support: float
 
 
+@one_thread
 def object_surface(
     field: DistanceField, point: Float[Tensor, "3"], config: SurfaceConfig | None = None, seed: int = 0
 ) -> ObjectSurface | None:
@@ -74,9 +83,9 @@ def object_surface(
     config = config or SurfaceConfig()
     if not torch.isfinite(point).all():
         raise FieldError(f"object_surface: the point must be finite, got {point.tolist()}.")
-    points, normals = zero_level(field, point, config, seed)
-    support = support_height(points, normals, float(point[2]), config)
-    standing = points[:, 2] > support + config.above
+    support = support_height(*zero_level(field, point, config.around, config, seed), float(point[2]), config)
+    points, normals = zero_level(field, point, config.radius, config, seed)
+    standing = (points[:, 2] > support + config.above).nonzero()[:MOST, 0]
     points, normals = points[standing], normals[standing]
     if len(points) == 0:
         return None
@@ -85,38 +94,37 @@ def object_surface(
 
 
 def zero_level(
-    field: DistanceField, point: Float[Tensor, "3"], config: SurfaceConfig, seed: int = 0
+    field: DistanceField, point: Float[Tensor, "3"], radius: float, config: SurfaceConfig, seed: int = 0
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Points of the zero level set within the radius [m] and the field's unit gradients there.
+    """Points of the zero level set within a radius [m] and the field's unit gradients there.
 
     Random points go down the distance by Newton steps; those nearer to the middle are drawn more often.
     """
     generator = torch.Generator().manual_seed(seed)
     ways = torch.nn.functional.normalize(torch.randn(config.samples, 3, generator=generator), dim=1)
-    reach = config.radius * torch.rand(config.samples, 1, generator=generator).sqrt()
+    reach = radius * torch.rand(config.samples, 1, generator=generator).sqrt()
     points = point + reach * ways
     for _ in range(6):
         distance, gradient = field.distance_and_gradient(points)
         slope = gradient.square().sum(dim=1, keepdim=True).clamp_min(0.25)
         points = points - (distance[:, None] * gradient / slope).clamp(-0.05, 0.05)
     distance, gradient = field.distance_and_gradient(points)
-    kept = (distance.abs() <= config.accuracy) & ((points - point).norm(dim=1) <= config.radius)
+    kept = (distance.abs() <= config.accuracy) & ((points - point).norm(dim=1) <= radius)
     if isinstance(field, ConfidentField):
         kept &= field.confidence(points) >= config.confidence
     return points[kept], torch.nn.functional.normalize(gradient[kept], dim=1)
 
 
 def support_height(points: Tensor, normals: Tensor, height: float, config: SurfaceConfig) -> float:
-    """Height [m] of the level face below `height` with the most points, -inf if there is none."""
-    level = (normals[:, 2] > 0.9) & (points[:, 2] < height + config.above)
-    heights = points[level, 2]
-    if len(heights) == 0:
+    """Height [m] of the largest level face below `height`, -inf if there is none."""
+    level = points[(normals[:, 2] > 0.9) & (points[:, 2] < height + config.above)]
+    if len(level) == 0:
         return -torch.inf
-    bins = torch.histc(heights, bins=max(1, int(2 * config.radius / 0.004)))
-    low, high = float(heights.min()), float(heights.max())
-    centre = low + (high - low) * (int(bins.argmax()) + 0.5) / len(bins)
-    near = (heights - centre).abs() < 0.008
-    return float(heights[near].median())
+    layer = (level[:, 2:] / LAYER).round()
+    cells = torch.cat([layer, (level[:, :2] / CELL).round()], dim=1).unique(dim=0)
+    layers, sizes = cells[:, 0].unique(return_counts=True)
+    near = (level[:, 2] - LAYER * layers[sizes.argmax()]).abs() < LAYER
+    return float(level[near, 2].median())
 
 
 def _joined_to(point: Tensor, points: Tensor, gap: float) -> Tensor:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import robots
-from benchmarks import closed_loop
+from benchmarks import navigation_episodes
+from benchmarks.episodes import run_missing
 from benchmarks.free_floor import FreeFloor
 from benchmarks.recheck import recheck
 from examples.disturbances import DisturbedRobot, MovedFurniture, People, PoseNoise, SensorFault
@@ -188,7 +189,7 @@ def test_a_disturbed_robot_is_a_mobile_robot() -> None:
         assert len(robot.recording) == 1 and robot.time == pytest.approx(0.1, abs=0.01)
 
 
-def pretend(task: closed_loop.Task) -> dict:
+def pretend(task: navigation_episodes.NavigationTask) -> dict:
     if task.number == 1:
         raise RuntimeError("the simulator fell over")
     drive = {"status": "reached", "message": "", "slowed": 3, "stopped": 2, "blind": 0}
@@ -204,19 +205,19 @@ def test_results_are_kept_and_errors_are_results(
 ) -> None:
     asked: list[int] = []
 
-    def noted(task: closed_loop.Task) -> dict:
+    def noted(task: navigation_episodes.NavigationTask) -> dict:
         asked.append(task.number)
         return pretend(task)
 
-    monkeypatch.setattr(closed_loop, "episode", noted)
-    monkeypatch.setattr(closed_loop, "make_scene", lambda name, seed=0: hall())
-    options = closed_loop.Options(out=tmp_path, scene="hall", episodes=3)
-    closed_loop.main(options)
+    monkeypatch.setattr(navigation_episodes, "episode", noted)
+    monkeypatch.setattr(navigation_episodes, "make_scene", lambda name, seed=0: hall())
+    options = navigation_episodes.Navigate(out=tmp_path, scene="hall", episodes=3)
+    run_missing(options)
     assert logging.root.manager.disable == logging.NOTSET, "other programs in this process still log"
     folders = sorted((tmp_path / "hall" / "default" / "none").iterdir())
     assert asked == [0, 1, 2] and [f.name for f in folders] == ["000", "001", "002"]
     (folders[2] / "report.json").unlink()
-    reports = closed_loop.main(options)
+    reports = run_missing(options)
     assert asked == [0, 1, 2, 2], "what is there is not run again"
     assert [json.loads((f / "report.json").read_text())["task"]["number"] for f in folders] == [0, 1, 2]
     assert reports[1]["error"] == "RuntimeError: the simulator fell over"
@@ -224,14 +225,14 @@ def test_results_are_kept_and_errors_are_results(
     assert (
         "| 3 | 2 | 1 | 1.20 |" in text and "episode 1: RuntimeError" in text and "touched arm - table" in text
     )
-    for task in closed_loop.make_tasks(options):
-        assert np.linalg.norm(np.array(task.start[:2]) - task.goal) >= closed_loop.APART
-        assert task.shortest >= closed_loop.APART * 0.99
+    for task in navigation_episodes.make_tasks(options):
+        assert np.linalg.norm(np.array(task.start[:2]) - task.goal) >= navigation_episodes.APART
+        assert task.shortest >= navigation_episodes.APART * 0.99
     capsys.readouterr()
 
 
 def test_a_scene_without_room_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(closed_loop, "APART", 20.0)
-    monkeypatch.setattr(closed_loop, "make_scene", lambda name, seed=0: hall())
+    monkeypatch.setattr(navigation_episodes, "APART", 20.0)
+    monkeypatch.setattr(navigation_episodes, "make_scene", lambda name, seed=0: hall())
     with pytest.raises(SystemExit, match="hall: only 0 starts and goals 20 m apart"):
-        closed_loop.main(closed_loop.Options(out=tmp_path, scene="hall", episodes=1))
+        run_missing(navigation_episodes.Navigate(out=tmp_path, scene="hall", episodes=1))

@@ -131,7 +131,15 @@ def test_the_grasp_lifts_the_object_and_touches_nothing_else(lift) -> None:
     assert report["success"] is True and report["ended"] == "success"
     assert report["contacts"] == 0 and report["contact_pairs"] == {}
     assert_complete(report, out)
-    assert {"lift_height", "held_seconds", "drive", "planning_seconds", "map", "robot_seconds"} <= set(report)
+    assert {
+        "lift_height",
+        "held_seconds",
+        "drive",
+        "planning_seconds",
+        "reason",
+        "map",
+        "robot_seconds",
+    } <= set(report)
     assert report["lift_height"] >= grasp.LIFTED and report["held_seconds"] == grasp.HELD_FOR
 
 
@@ -143,7 +151,8 @@ def test_the_grasp_report_agrees_with_the_states(lift) -> None:
     held = saved["time"] >= saved["time"][-1] - grasp.HELD_FOR + 0.05
     assert held.sum() >= 10
     assert height[held].min() - height[0] >= grasp.LIFTED - 0.01
-    np.testing.assert_allclose(saved["base_pose"][-1, :2], task.park[:2], atol=0.06)
+    thing = saved["object_poses"][0, list(saved["object_names"]).index(task.object_name), :2, 3]
+    assert 0.5 < np.linalg.norm(saved["base_pose"][-1, :2] - thing) < 0.95, "parked within the arm's reach"
     others = [i for i, name in enumerate(saved["object_names"]) if name != task.object_name]
     places = saved["object_poses"][10:, :, :3, 3][:, others]  # after they have settled
     assert np.linalg.norm(places - places[0], axis=-1).max(initial=0.0) < 0.02, "nothing else was moved"
