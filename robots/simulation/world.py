@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -14,12 +15,15 @@ from robots.errors import RobotError, SceneError
 from robots.simulation.articulation import JointVector
 from robots.simulation.base import DriveConfig
 from robots.simulation.contacts import Contact, robot_contacts
+from robots.simulation.native_output import logged_instead
 from robots.simulation.poses import pose_matrix, split_pose
 from robots.simulation.primitives import Box, Cylinder, Primitive
 from robots.simulation.scene_sdf import SceneField
 from robots.simulation.scenes import Scene
 from robots.simulation.simulated_robot import GripperModel, MotorConfig, SimulatedRobot
 from robots.simulation.urdf_object import UrdfObject
+
+logger = logging.getLogger(__name__)
 
 
 class World:
@@ -243,7 +247,8 @@ class World:
 
     def _load_scene(self, path: Path) -> int:
         try:
-            body = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=self.client)
+            with logged_instead(logger):
+                body = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=self.client)
         except pybullet.error as error:
             raise SceneError(f"pybullet cannot load {path}: {error}; check its mesh paths") from error
         self._names[body] = _link_names(self.client, body)
