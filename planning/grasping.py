@@ -70,7 +70,7 @@ class GraspConfig:
     pad: float = 0.02
     play: float = 0.006
     antipodal: float = 0.85
-    hold: float = 0.3
+    hold: float = 0.5
     room: float = -0.003
     confidence: float = 0.65
     retreat: float = 0.12
@@ -148,9 +148,21 @@ def find_grasps(
     return _with_room(field, grasps.take(good), hand, config)
 
 
-def _turns(config: GraspConfig) -> Float[Tensor, "t 3 3"]:
+def _yaw(surface: ObjectSurface) -> float:
+    """Heading [rad] of the narrowest upright box round an object: boxes are gripped square, or not at all."""
+    angles = torch.arange(0, 90, 2) * (math.pi / 180)
+    axes = torch.stack([angles.cos(), angles.sin()], dim=1)
+    spans = [
+        surface.points[:, :2] @ turned.T for turned in (axes, torch.stack([-axes[:, 1], axes[:, 0]], dim=1))
+    ]
+    ends = torch.tensor([0.02, 0.98])
+    sides = [span.quantile(ends, dim=0).diff(dim=0)[0] for span in spans]
+    return float(angles[(sides[0] * sides[1]).argmin()])
+
+
+def _turns(config: GraspConfig, yaw: float) -> Float[Tensor, "t 3 3"]:
     """Rotations of the tool: fingers (z) along a heading and down by a pitch, closing line (y) level."""
-    psi = torch.arange(config.headings) * (2 * math.pi / config.headings)
+    psi = yaw + torch.arange(config.headings) * (2 * math.pi / config.headings)
     theta = torch.tensor(config.pitches)
     psi, theta = (grid.reshape(-1) for grid in torch.meshgrid(psi, theta, indexing="ij"))
     cos, sin, zero = psi.cos(), psi.sin(), torch.zeros_like(psi)
