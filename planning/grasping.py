@@ -134,7 +134,9 @@ def find_grasps(
     surface = ObjectSurface(surface.points[drawn], surface.normals[drawn], surface.support)
     anchors = surface.points[: config.anchors]
     found = [
-        _along(surface, anchors, turn, hand, bite, config) for turn in _turns(config) for bite in config.bites
+        _along(surface, anchors, turn, hand, bite, config)
+        for turn in _turns(config, _yaw(surface))
+        for bite in config.bites
     ]
     T, width, antipodal, hold = (torch.cat(parts) for parts in zip(*found, strict=True))
     grasps = Grasps(
