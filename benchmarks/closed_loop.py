@@ -6,8 +6,8 @@
     python -m benchmarks.closed_loop grasp --objects FOLDER --episodes 50 --out runs/grasps
 
 Every episode leaves report.json and states.npz (time, base pose, joint positions, poses of everything that moves) in
-OUT/SCENE/METHOD/DISTURBANCE/NUMBER or OUT/METHOD/NUMBER, the summary is OUT/summary.md. Contacts are counted twice: by
-the physics while it runs, and from the recorded states in a fresh world.
+OUT/SCENE/METHOD/DISTURBANCE/NUMBER or OUT/OBJECTS/METHOD/NUMBER, the summary is OUT/summary.md. Contacts are counted
+twice: by the physics while it runs, and from the recorded states in a fresh world.
 """
 
 from __future__ import annotations

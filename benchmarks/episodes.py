@@ -50,9 +50,12 @@ class EpisodesOptions(Workers):
 
 
 def run_missing(options: EpisodesOptions) -> list[dict]:
-    """Run the episodes that have no report yet, write summary.md; returns all reports."""
+    """Run the episodes that have no report yet, write summary.md; returns all reports.
+
+    Refuses a folder whose reports are of other episodes, such as those of another seed.
+    """
     tasks = options.tasks()
-    missing = [task for task in tasks if not (Path(task.folder) / "report.json").exists()]
+    missing = [task for task in tasks if not is_done(task)]
     with at_work(options):
         mode = "list" if options.backend == "ray" else "generator_unordered"
         done = Parallel(n_jobs=options.jobs, return_as=mode)(delayed(attempt)(task) for task in missing)
@@ -62,6 +65,20 @@ def run_missing(options: EpisodesOptions) -> list[dict]:
     (options.out / "summary.md").write_text(text)
     print(text)
     return reports
+
+
+def is_done(task: Task) -> bool:
+    """Whether there is a report of this very episode; refuses one of another."""
+    path = Path(task.folder) / "report.json"
+    if not path.exists():
+        return False
+    found, told = json.loads(path.read_text())["task"], json.loads(json.dumps(task.told()))
+    other = sorted(key for key in told if key != "folder" and found.get(key) != told[key])
+    if other:
+        raise SystemExit(
+            f"{path} is of another episode: its {', '.join(other)} differ; choose another --out, or the options it had"
+        )
+    return True
 
 
 def attempt(task: Task) -> None:

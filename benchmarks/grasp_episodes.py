@@ -36,7 +36,7 @@ class GraspThings(EpisodesOptions):
         order = [
             name for _ in range(-(-self.episodes // len(names))) for name in rng.permutation(names).tolist()
         ]
-        folder = self.out / self.method
+        folder = self.out / ("shapes" if self.objects is None else self.objects.resolve().name) / self.method
         return [
             GraspTaskOf(
                 str((folder / f"{number:03d}").resolve()),
@@ -92,7 +92,6 @@ class GraspTaskOf:
             "ended": ended,
             "reason": grasping.reason,
             "lifted": ended == "success",
-            "success": ended == "success" and not contacts,
             "lift_height": grasping.lift_height,
             "contacts": contacts,
             "drive": dataclasses.asdict(drive) | {"status": drive.status.value},
@@ -101,7 +100,11 @@ class GraspTaskOf:
         }
         grasping.episode.close()
         again = unwanted(recheck(self.the_scene(), folder / "states.npz"))
-        return report | {"contacts_rechecked": again, "cpu_seconds": time.process_time() - began}
+        return report | {
+            "success": ended == "success" and not contacts and not again,
+            "contacts_rechecked": again,
+            "cpu_seconds": time.process_time() - began,
+        }
 
 
 def unwanted(touched: dict[str, float]) -> dict[str, float]:

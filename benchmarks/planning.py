@@ -27,8 +27,8 @@ if not __package__:  # run as a file
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import robots
-from benchmarks.planning_check import Checker, checked_robot
-from benchmarks.planning_rivals import PLANNERS, Planner
+from benchmarks.planning_check import Checker
+from benchmarks.planning_rivals import PLANNERS, Planner, checked_robot
 from planning.problems import Problem, load_problems
 from planning.solve import SolveConfig
 

@@ -15,14 +15,10 @@ import numpy as np
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
 
-from robots import Robot
-
 TOLERANCE = 1e-3  # [m] of penetration
 STEP = 0.02  # [rad | m] between interpolated states, in the joint that moves most
 GOAL_POSITION, GOAL_ANGLE = 0.01, np.deg2rad(5.0)
 LIMIT_TOLERANCE = 1e-4  # [rad | m]; problems' own starts are rounded
-# Of a base that stands on the floor only what its wheels touch would collide.
-IGNORED = {"fetch": frozenset({"base_link"})}
 RATE_TOLERANCE = 1e-6  # relative, of velocities and accelerations
 
 
@@ -41,14 +37,6 @@ class CheckedRobot:
     tool_link: str
     allowed: frozenset[frozenset[str]]
     ignored_links: frozenset[str] = frozenset()
-
-
-def checked_robot(name: str, robot: Robot) -> CheckedRobot:
-    """A ready-made robot for the checker."""
-    allowed = robot.sphere_set.ignored_pairs | robot.tree.neighbours(tuple(robot.sphere_set.spheres))
-    tool = robot.tool_link
-    assert tool is not None
-    return CheckedRobot(robot.urdf_path, tool, frozenset(allowed), IGNORED.get(name, frozenset()))
 
 
 class Checker:

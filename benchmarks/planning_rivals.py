@@ -12,13 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.planning_check import checked_robot
+from benchmarks.planning_check import CheckedRobot
 from planning.exact_shape import exact_shape
 from planning.problems import Problem
 from planning.solve import Solver
 from robots import Robot
 
 OMPL_RESOLUTION = 0.001  # of the space's extent, between two states that OMPL tests on an edge
+
+# Of a base that stands on the floor only what its wheels touch would collide.
+IGNORED = {"fetch": frozenset({"base_link"})}
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,14 @@ class Answer:
 
 
 Planner = Callable[[Problem, float], Answer]
+
+
+def checked_robot(name: str, robot: Robot) -> CheckedRobot:
+    """A ready-made robot for the checker."""
+    allowed = robot.sphere_set.ignored_pairs | robot.tree.neighbours(tuple(robot.sphere_set.spheres))
+    tool = robot.tool_link
+    assert tool is not None
+    return CheckedRobot(robot.urdf_path, tool, frozenset(allowed), IGNORED.get(name, frozenset()))
 
 
 def ours(robot_name: str, robot: Robot) -> Planner:

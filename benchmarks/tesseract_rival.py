@@ -191,7 +191,6 @@ def trajopt_solver(robot: CheckedRobot, joints: Sequence[str], limits: np.ndarra
             request.env, request.profiles = world.environment, settings
             request.instructions = program(joints, seed)
             response = trajopt.TrajOptMotionPlanner(PLANNER).solve(request)
-
             if response.successful:
                 return waypoints(response.results)
             if time.perf_counter() > ends_at:

@@ -12,7 +12,7 @@ from torch import Tensor
 import planning
 import robots
 from examples.disturbances import DisturbedRobot
-from planning.grasping import Grasps, ParallelHand
+from planning.grasping import GraspConfig, Grasps, ParallelHand
 from planning.protocols import DistanceField
 from planning.workspace import Workspace
 from robots.fine_cover import fine_cover
@@ -36,8 +36,6 @@ class Grasp:
     """(k, dof), from the pre-grasp posture to the grasp."""
     lift: Tensor
     """(k, dof), from the grasp upwards."""
-    score: float
-    """What it was ranked by."""
 
 
 def open_hand(model: robots.Robot) -> ParallelHand:
@@ -62,7 +60,7 @@ def reachable_grasps(
     q: Tensor,
     grasps: Grasps,
     field: DistanceField,
-    retreat: float = 0.12,
+    retreat: float = GraspConfig.retreat,
     rise: float = 0.14,
     seed: int = 0,
 ) -> Iterator[Grasp]:
@@ -95,7 +93,7 @@ def reachable_grasps(
             if lift is None or clearance(model, torch.cat([approach, lift]), field, arm) < ARM_ROOM:
                 continue
             if clearance(model, ends.q[i : i + 1], field) > 0:
-                yield Grasp(approach, lift, float(grasps.score[block[i]]))
+                yield Grasp(approach, lift)
 
 
 def straight_line(

@@ -10,6 +10,7 @@ read from the physics: lifted 10 cm, held for 2 s.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import sys
 import time
@@ -60,21 +61,15 @@ class GraspEpisode:
     Args:
         options: see `GraspOptions`.
         scene: with a grasp task; the one that the options name if None.
-        start: base pose x, y [m], yaw [rad]; some way before the task's parking place if None.
     """
 
-    def __init__(
-        self,
-        options: GraspOptions,
-        scene: Scene | None = None,
-        start: tuple[float, float, float] | None = None,
-    ) -> None:
+    def __init__(self, options: GraspOptions, scene: Scene | None = None) -> None:
         self.options = options
         scene = scene or chosen_scene(options)
         if scene.grasp is None:
             raise SystemExit(f"{options.scene} has no object to grasp; choose apartment, office or flat")
         self.task: GraspTask = scene.grasp
-        start = start or start_before(scene, self.task, options.distance, options.seed)
+        start = start_before(scene, self.task, options.distance, options.seed)
         self.episode = Episode(options, start, scene=scene)
         self.episode.robot.wait(1.0)  # until things have come to rest
         self.point = click_on(
@@ -91,12 +86,8 @@ class GraspEpisode:
     def run(self) -> str:
         """Returns "success" or the stage that failed."""
         self.go(self.episode.robot.base_state(), scan=2 * math.pi)
-        ended, tried = "approach", 0
-        self.reason = "no place to park in reach of the point"
-        for place in self.places():
-            if tried == PLACES:
-                break
-            tried += 1
+        ended, self.reason = "approach", "no place to park in reach of the point"
+        for place in itertools.islice(self.places(), PLACES):
             self.bar.set_description("approaching")
             if not self.go(np.array(place)):
                 assert self.drive is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -70,4 +71,7 @@ def test_results_say_which_thing_and_which_stage_lost(tmp_path: Path, monkeypatc
     assert "error 1" in text and "planning 1" in text and "contact 1" in text
     assert f"episode 2 ({reports[2]['task']['thing']}, table): planning: no way" in text
     assert "touched arm_4_link - left" in text
+    assert run_missing(options) == reports
+    with pytest.raises(SystemExit, match=r"of another episode: its .*seed.* differ; choose another --out"):
+        run_missing(dataclasses.replace(options, seed=1))
     capsys.readouterr()

@@ -10,8 +10,8 @@ import torch
 
 import robots
 from benchmarks import planning as benchmark
-from benchmarks.planning_check import Checker, checked_robot
-from benchmarks.planning_rivals import PLANNERS, Answer
+from benchmarks.planning_check import Checker
+from benchmarks.planning_rivals import PLANNERS, Answer, checked_robot
 from planning import Trajectory, retime
 from planning.problems import load_problems
 

@@ -203,7 +203,7 @@ def test_every_bound_trains(bound) -> None:
     mapper = IsdfMapper(replace(SMALL, bound=bound, first_frame_steps=0))
     mapper.integrate(furnished_orbit(12)[0])
     losses = [mapper.step() for _ in range(160)]
-    assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:10])
+    assert np.mean(losses[-10:]) < 0.6 * np.mean(losses[:10])
 
 
 def test_the_papers_and_the_released_sizes_make_a_step() -> None:
