@@ -176,6 +176,33 @@ class GridField(AnalyticField):
         return c, cell - base, unclamped == cell
 
 
+class ConfidentGridField(GridField):
+    """A `GridField` that knows how sure the field was that it was sampled from.
+
+    Args:
+        values: (nx, ny, nz) signed distances [m].
+        origin: (3,) world position [m] of the first value.
+        spacing: distance of grid points [m].
+        confidence: (nx, ny, nz) in [0, 1].
+    """
+
+    def __init__(
+        self,
+        values: Float[Tensor, "nx ny nz"],
+        origin: Float[Tensor, "3"],
+        spacing: float,
+        confidence: Float[Tensor, "nx ny nz"],
+    ) -> None:
+        super().__init__(values, origin, spacing)
+        self._confidence = GridField(confidence, origin, spacing)
+
+    def confidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Interpolated confidence in [0, 1] at world points [m], 0 outside the grid."""
+        check_points(points)
+        inside = ((points >= self.bounds[0].to(points)) & (points <= self.bounds[1].to(points))).all(dim=-1)
+        return self._confidence._distance(points) * inside
+
+
 def _trilinear(c: list, t: Tensor) -> tuple[Tensor, tuple[list, list]]:
     """Value of trilinear interpolation at t in [0, 1]^3, and the intermediate edges and faces."""
     x, y, z = t.unbind(dim=-1)
@@ -206,10 +233,16 @@ def grid_points(bounds: Float[Tensor, "2 3"], spacing: float) -> Float[Tensor, "
 
 
 def bake(field: Any, bounds: Float[Tensor, "2 3"], spacing: float, padding: float = 0.0) -> GridField:
-    """Sample any distance field on a regular grid over `bounds` (2, 3) [m] grown by `padding` [m]."""
+    """Sample any distance field on a regular grid over `bounds` (2, 3) [m] grown by `padding` [m].
+
+    Where the field offers `confidence`, so does the grid.
+    """
     bounds = bounds.float() + padding * torch.tensor([[-1.0], [1.0]], device=bounds.device)
     points = grid_points(bounds, spacing)
-    return GridField(field.distance(points), bounds[0], spacing)
+    distance = field.distance(points)
+    if hasattr(field, "confidence"):
+        return ConfidentGridField(distance, bounds[0], spacing, field.confidence(points))
+    return GridField(distance, bounds[0], spacing)
 
 
 def query(field: Any, points: np.ndarray) -> dict[str, np.ndarray]:

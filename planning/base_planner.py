@@ -10,12 +10,14 @@ from torch import Tensor
 
 from planning.chomp import Chomp, ChompConfig
 from planning.errors import ConfigError
+from planning.explored import ExploredField
 from planning.grid_search import GridSearchConfig, Route, grid_search
-from planning.protocols import DistanceField, SphereRobot
+from planning.protocols import ConfidentField, DistanceField, ObservingField, SphereRobot
 from planning.result import PlanResult
 from planning.threads import one_thread
 from planning.trajectory import Trajectory
 from planning.validation import check
+from planning.workspace import Workspace, WorkspaceConfig
 
 
 @dataclass(frozen=True)
@@ -23,19 +25,26 @@ class BasePlannerConfig:
     """How the base plans.
 
     Args:
-        search: finds the route that CHOMP starts from.
+        search: finds the route that CHOMP starts from; its rules for unknown space are those of plans.
         chomp: the optimiser; its margin is set by the planner.
         num_waypoints: of a plan.
         margin: clearance [m] that plans keep where the map has a route with as much.
         clearance_change: a plan is no longer good when the map has taken this much [m] of its clearance.
         off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
         looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
+        stood: unknown space this near [m] to where the base has stood counts as seen: a camera on the robot cannot see
+            it, and the robot was there.
     """
 
     # A map still being learned is some centimetres wrong, and the robot stands where it stands: hence the negative
     # least margin.
     search: GridSearchConfig = field(
-        default_factory=lambda: GridSearchConfig(least_margin=-0.05, through_blocked=30.0)
+        default_factory=lambda: GridSearchConfig(
+            least_margin=-0.05,
+            through_blocked=30.0,
+            through_unknown=2.0,
+            workspace=WorkspaceConfig(unknown_confidence=0.5),
+        )
     )
     chomp: ChompConfig = field(default_factory=lambda: ChompConfig(eps=0.35, max_iterations=120))
     num_waypoints: int = 40
@@ -43,6 +52,7 @@ class BasePlannerConfig:
     clearance_change: float = 0.05
     off_path: float = 0.25
     looks: int = 3
+    stood: float = 0.5
 
     def __post_init__(self) -> None:
         low = self.num_waypoints < 3 or self.looks < 1
@@ -65,11 +75,14 @@ class BasePlan:
         result: the path with its verdict.
         reaches_goal: whether it leads to the goal, or only nearer to it.
         dead_end: whether it leads nowhere, because the robot stands where it ends already.
+        entry: where it would go on through unknown or blocked space [m], and what is to be looked at; None if it
+            reaches the goal or no way leads there.
     """
 
     result: PlanResult
     reaches_goal: bool
     dead_end: bool
+    entry: Float[Tensor, "2"] | None = None
 
     @property
     def usable(self) -> bool:
@@ -99,24 +112,33 @@ class BasePlanner:
     def __init__(self, body: SphereRobot, config: BasePlannerConfig | None = None, seed: int = 0) -> None:
         self.body, self.config, self.seed = body, config or BasePlannerConfig(), seed
         self._entries: list[Tensor] = []
+        self._trail: list[Tensor] = []
 
     def forget(self) -> None:
         """Forget the dead ends, for another goal."""
         self._entries = []
 
+    def stood(self, position: Float[Tensor, "2"]) -> None:
+        """Take note that the base has been at a position [m]: space there is free, whether or not it was seen."""
+        if not self._trail or (self._trail[-1] - position).norm() > 0.25 * self.config.stood:
+            self._trail.append(position)
+
     @one_thread
-    def plan(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField) -> BasePlan:
-        """Plan from start to goal [m]; a dead end is remembered."""
-        route = self.route(start, goal, sdf)
-        result = self._optimised(route, sdf)
+    def plan(
+        self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField, route: Route | None = None
+    ) -> BasePlan:
+        """Plan from start to goal [m], through seen space, along `route` if it is known; a dead end is remembered."""
+        route = route or self.route(start, goal, sdf)
+        result = self._optimised(route, self._explored(sdf))
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
             self._entries.append(route.entry)
-        return BasePlan(result, route.reaches_goal, dead_end)
+        return BasePlan(result, route.reaches_goal, dead_end, route.entry)
 
     def route(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField) -> Route:
         """The way that `plan` would start from."""
-        return grid_search(self.body, sdf, start, goal, self.config.search, self._closed())
+        self.stood(start)
+        return grid_search(self.body, self._explored(sdf), start, goal, self.config.search, self._closed())
 
     def still_good(self, plan: PlanResult, position: Float[Tensor, "2"], sdf: DistanceField) -> bool:
         """Whether what is left of a plan from where the base stands [m] keeps its clearance on a new map."""
@@ -128,8 +150,14 @@ class BasePlanner:
         clearance = check(self.body, left, sdf, self.config.chomp.validation).clearance
         return clearance >= min(self.config.margin, plan.clearance) - self.config.clearance_change
 
+    def _explored(self, sdf: DistanceField) -> DistanceField:
+        """The field with what it has not seen as unknown; the field itself where it does not tell."""
+        if isinstance(sdf, ObservingField | ConfidentField):
+            return ExploredField(sdf, torch.stack(self._trail), self.config.stood)
+        return sdf
+
     def _optimised(self, route: Route, sdf: DistanceField) -> PlanResult:
-        """CHOMP from the route, or the route itself where CHOMP leaves it.
+        """CHOMP from the route, or the route itself where CHOMP fails or leaves seen space.
 
         The clearance asked for is what the route has, at most the margin; the cost still seeks more.
         """
@@ -141,7 +169,7 @@ class BasePlanner:
         chomp = Chomp(self.body, replace(config.chomp, validation=validation), self.seed)
         guess = Trajectory.through(route.path, config.num_waypoints) if len(path) > 1 else path
         result = chomp.optimise(guess, sdf)
-        if result.success:
+        if result.success and self._stays_in_seen_space(result.trajectory, sdf):
             return result
         verdict = check(self.body, path, sdf, validation)
         return replace(
@@ -151,6 +179,13 @@ class BasePlanner:
             message=f"the searched route: {verdict.message}",
             clearance=verdict.clearance,
         )
+
+    def _stays_in_seen_space(self, path: Trajectory, sdf: DistanceField) -> bool:
+        """Whether a path enters no unknown space, by the rules of the search."""
+        workspace = Workspace(self.body, sdf, eps=1.0, config=self.config.search.workspace)
+        centres, _ = self.body.spheres(Trajectory.through(path.waypoints, 4 * len(path)).waypoints)
+        unknown = workspace.unknown(centres)
+        return unknown is None or not bool(unknown.any())
 
     def _leads_nowhere(self, route: Route, goal: Float[Tensor, "2"]) -> bool:
         """Whether the robot already stands where the route ends, or would only circle a walled-in goal."""

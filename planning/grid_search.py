@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -31,9 +31,10 @@ class GridSearchConfig:
         caution: how many times longer a way at the least margin counts than one at the margin.
         escape: where the start is blocked, positions this near to it [m] are not, unless they are less clear: the
             robot stands there and may leave, but not go in deeper.
-        through_blocked: how many times longer a way through blocked space counts than a free one, for maps that may
-            be wrong about what was not seen yet. Where no free way leads to the goal, the route then follows the
-            cheapest way through blocked space up to where that begins, such as a doorway. inf: never.
+        through_blocked: how many times longer a way through obstacles counts than a free one, for maps that may be
+            wrong about them. Where no free way leads to the goal, the route then follows the cheapest way through
+            blocked space up to where that begins, such as a doorway. inf: never.
+        through_unknown: the same for a way through unknown space, on top of what the field's guesses there cost.
         closed_radius: blocked space this near [m] to a closed place is never entered.
         workspace: rules for the floor and for unknown space, which counts as blocked.
     """
@@ -45,14 +46,16 @@ class GridSearchConfig:
     caution: float = 10.0
     escape: float = 0.25
     through_blocked: float = math.inf
+    through_unknown: float = math.inf
     closed_radius: float = 0.6
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
 
     def __post_init__(self) -> None:
-        if min(self.spacing, self.padding) <= 0 or self.margin <= self.least_margin or self.caution < 1:
+        prices = min(self.caution, self.through_blocked, self.through_unknown)
+        if min(self.spacing, self.padding) <= 0 or self.margin <= self.least_margin or not prices >= 1:
             raise ConfigError(
-                "GridSearchConfig: spacing and padding must be positive, margin above least_margin and caution at "
-                f"least 1, got {self}."
+                "GridSearchConfig: spacing and padding must be positive, margin above least_margin and caution, "
+                f"through_blocked and through_unknown at least 1, got {self}."
             )
 
 
@@ -101,14 +104,16 @@ def grid_search(
             f"grid_search: start and goal must be finite, got {start.tolist()} and {goal.tolist()}."
         )
     positions, shape = _grid(start, goal, config)
-    cost = _cost(robot, sdf, positions, start, config)
+    cost, price = _costs(robot, sdf, positions, start, config)
     near_start, near_goal = (int((positions - p).norm(dim=1).argmin()) for p in (start, goal))
     cells, reach = _cheapest(cost, shape, config.spacing, near_start, near_goal)
     if cells:
         path = torch.cat([start[None], positions[cells][1:-1], goal[None]])
         return Route(path, True)
-    optimistic = _through_blocked(cost, positions, closed, config)
-    cells, _ = _cheapest(optimistic, shape, config.spacing, near_start, near_goal)
+    if closed is not None and len(closed):
+        near = torch.cdist(positions, closed).amin(dim=1) <= config.closed_radius
+        price = price.masked_fill(torch.isinf(cost) & near, torch.inf)
+    cells, _ = _cheapest(price, shape, config.spacing, near_start, near_goal)
     if cells:
         first = int(torch.isinf(cost[cells]).float().argmax())
         return Route(torch.cat([start[None], positions[cells[1:first]]]), False, positions[cells[first]])
@@ -131,18 +136,6 @@ def _cheapest(
     return cells[::-1], reach
 
 
-def _through_blocked(
-    cost: Tensor, positions: Tensor, closed: Tensor | None, config: GridSearchConfig
-) -> Float[Tensor, "n"]:
-    """The cost with blocked space passable at its price, but for what is closed."""
-    blocked = torch.isinf(cost)
-    optimistic = cost.masked_fill(blocked, config.through_blocked)
-    if closed is not None and len(closed):
-        near = torch.cdist(positions, closed).amin(dim=1) <= config.closed_radius
-        optimistic = optimistic.masked_fill(blocked & near, torch.inf)
-    return optimistic
-
-
 def _grid(
     start: Tensor, goal: Tensor, config: GridSearchConfig
 ) -> tuple[Float[Tensor, "n 2"], tuple[int, int]]:
@@ -158,30 +151,44 @@ def _grid(
     return grid.reshape(-1, 2), (len(axes[0]), len(axes[1]))
 
 
-def _cost(
+def _costs(
     robot: SphereRobot, sdf: DistanceField, positions: Tensor, start: Tensor, config: GridSearchConfig
-) -> Float[Tensor, "n"]:
-    """What a metre of way counts at each position; inf where blocked."""
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """What a metre of way counts at each position: inf where blocked; and with blocked space at its price."""
     workspace = Workspace(robot, sdf, eps=1.0, config=config.workspace)
-    clearance = torch.empty(len(positions), dtype=positions.dtype)
-    unknown = torch.zeros(len(positions), dtype=torch.bool)
-    for block in torch.arange(len(positions)).split(500):
-        centres, radii = robot.spheres(positions[block])
-        clearance[block] = workspace.clearance(centres, radii).amin(dim=-1)
-        seen = workspace.unknown(centres)
-        if seen is not None:
-            unknown[block] = seen.any(dim=-1)
-    short = ((config.margin - clearance) / (config.margin - config.least_margin)).clamp(min=0.0)
     away = (positions - start).norm(dim=1)
     here = int(away.argmin())
+    clearance = _clearance_of_a_few(robot, workspace, positions)
+    unknown = torch.zeros(len(positions), dtype=torch.bool)
+    # What a few spheres find blocked is blocked, and need not be known better, except where the robot may escape.
+    for block in ((clearance >= config.least_margin) | (away <= config.escape)).nonzero()[:, 0].split(500):
+        centres, radii = robot.spheres(positions[block])
+        clearance[block] = workspace.clearance(centres, radii).amin(dim=-1)
+        hidden = workspace.unknown(centres)
+        if hidden is not None:
+            unknown[block] = hidden.any(dim=-1)
+    short = ((config.margin - clearance) / (config.margin - config.least_margin)).clamp(min=0.0)
     escape = (away <= config.escape) & (clearance >= clearance[here]) & (unknown <= unknown[here])
-    blocked = _blocked(clearance, unknown, config) & ~escape
-    cost = 1 + (config.caution - 1) * short
-    return cost.masked_fill(blocked, torch.inf)
+    solid = ~(clearance >= config.least_margin) & ~escape  # NaN is blocked
+    unknown &= ~escape
+    price = (1 + (config.caution - 1) * short).masked_fill(solid, config.through_blocked)
+    cost = price.masked_fill(solid | unknown, torch.inf)
+    return cost, torch.where(unknown, config.through_unknown * price, price)
 
 
-def _blocked(clearance: Tensor, unknown: Tensor, config: GridSearchConfig) -> Bool[Tensor, "n"]:
-    return ~(clearance >= config.least_margin) | unknown  # NaN is blocked
+def _clearance_of_a_few(
+    robot: SphereRobot, workspace: Workspace, positions: Float[Tensor, "n 2"]
+) -> Float[Tensor, "n"]:
+    """The least clearance [m] of every eighth sphere that may not touch the floor."""
+    few = torch.arange(len(robot.spheres(positions[:1])[1]))
+    if workspace.floor is not None:
+        few = few[~workspace.floor]
+    few = few[::8]
+    out = torch.full((len(positions),), torch.inf, dtype=positions.dtype)
+    for block in torch.arange(len(positions)).split(2000) if len(few) else ():
+        centres, radii = robot.spheres(positions[block])
+        out[block] = (workspace.field.distance(centres[:, few]) - radii[few]).amin(dim=-1)
+    return out
 
 
 def _graph(cost: Float[ndarray, "n"], shape: tuple[int, int], spacing: float) -> csr_array:

@@ -38,6 +38,15 @@ class ConfidentField(DistanceField, Protocol):
 
 
 @runtime_checkable
+class ObservingField(DistanceField, Protocol):
+    """A distance field that tells space that was looked at from space that was not, however sure its distances are."""
+
+    def observed(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether somebody looked at points [m]: False where the field only guesses."""
+        ...
+
+
+@runtime_checkable
 class CostField(Protocol):
     """An obstacle cost c(f(x) - r) over a distance field f, as in CHOMP (Zucker et al. 2013, section 3.2)."""
 

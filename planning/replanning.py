@@ -22,6 +22,7 @@ from planning.clock import Clock, MeasuredClock, OnlineMap
 from planning.collision_monitor import CollisionMonitor
 from planning.drive import DriveReport, DriveStatus, MobileRobot
 from planning.errors import ConfigError
+from planning.grid_search import Route
 from planning.protocols import DistanceField, SphereRobot
 from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
@@ -30,6 +31,8 @@ logger = logging.getLogger(__name__)
 
 # The base has made progress since a failure when it is this far from where it stood then [m].
 PROGRESS = 0.1
+# The camera looks at what is within this angle of the way it faces [rad].
+FACING = 0.3
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,11 @@ class ReplanningConfig:
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
         look_ahead: distance along the path [m] at which the camera looks.
+        look_near: the same for the floor while it turns on the spot.
+        look_heights: heights [m] there between which it nods: no view is wide enough to see both what stands on the
+            floor and what hangs as high as the robot's head.
+        nod: time [s] at each of them.
+        extend: a plan that ends before unknown space is made anew when the map would lead this much [m] on.
         stuck: the plan is given up when the collision monitor has held the base for this long [s].
         patience: plans that may fail, or not be followed, without progress before the goal is called unreachable.
         time_limit: [s] of the robot's time.
@@ -54,6 +62,10 @@ class ReplanningConfig:
     scan_rate: float = 0.5
     retry: float = 1.0
     look_ahead: float = 1.5
+    look_near: float = 0.7
+    look_heights: tuple[float, ...] = (0.0, 1.1)
+    nod: float = 0.6
+    extend: float = 0.5
     stuck: float = 2.0
     patience: int = 15
     time_limit: float = 180.0
@@ -110,6 +122,7 @@ class ReplanningLoop:
         self._failures, self._failed_at = 0, np.full(2, math.inf)
         self._retry_at = -math.inf
         self._to_goal = False
+        self._entry: np.ndarray | None = None
         self._mapped = False
 
     def drive_to(self, goal: Float[ndarray, "2"], final_yaw: float | None = None) -> DriveReport:
@@ -199,13 +212,16 @@ class ReplanningLoop:
         self.field = self.snapshot()
         start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
         end = torch.as_tensor(goal, dtype=torch.float32)
+        route = None
         if self.plan is not None and self.planner.still_good(self.plan, start, self.field):
             if self._to_goal:
                 return self.plan
-            if not self.tracker.finished and not self.planner.route(start, end, self.field).reaches_goal:
+            route = self.planner.route(start, end, self.field)
+            if not self.tracker.finished and not self._leads_on(route):
                 return self.plan
-        fresh = self.planner.plan(start, end, self.field)
+        fresh = self.planner.plan(start, end, self.field, route)
         self.report.plans += 1
+        self._entry = None if fresh.entry is None else fresh.entry.numpy().astype(float)
         if fresh.usable:
             # A plan that the base cannot begin to follow is as good as none.
             gone = float(np.linalg.norm(self.robot.base_state()[:2] - self._failed_at))
@@ -215,11 +231,17 @@ class ReplanningLoop:
         self._give_up_plan(fresh.reason)
         return None
 
+    def _leads_on(self, route: Route) -> bool:
+        """Whether a route gets further than the plan that is followed, which ends before the goal."""
+        assert self.plan is not None
+        ends = route.path[-1], self.plan.trajectory.waypoints[-1]
+        return route.reaches_goal or float((ends[0] - ends[1]).norm()) > self.config.extend
+
     def _follow(self, duration: float, final_yaw: float | None) -> None:
         """Let time pass on the plan; without one, turn on the spot to see more."""
         if self.plan is None:
-            self._ahead(self.robot.base_state())
-            self._pass_time(duration, lambda _: (0.0, self.config.scan_rate))
+            turn = self._turn_to_entry(self.robot.base_state())
+            self._pass_time(duration, lambda _: (0.0, turn))
             return
         path = self.plan.trajectory.waypoints.numpy().astype(float)
 
@@ -235,6 +257,7 @@ class ReplanningLoop:
         self._owed += duration
         for _ in range(max(1, int(self._owed / period))):
             before = self.robot.base_state()
+            self.planner.stood(torch.as_tensor(before[:2], dtype=torch.float32))
             self.robot.drive(*self._monitored(before, *command(before)), period)
             self.report.path_length += float(np.linalg.norm(self.robot.base_state()[:2] - before[:2]))
             self._owed -= period
@@ -275,6 +298,21 @@ class ReplanningLoop:
         self.report.note(self.robot.time - self._started, reason)
         logger.info("no plan: %s", reason)
 
+    def _turn_to_entry(self, state: ndarray) -> float:
+        """Look at where the way would go on, if there is such a place, and else around; returns the turning rate.
+
+        The next attempt waits until the camera faces that place.
+        """
+        if self._entry is None:
+            self._ahead(state)
+            return self.config.scan_rate
+        away = self._entry - state[:2]
+        error = math.remainder(math.atan2(away[1], away[0]) - state[2], 2 * math.pi)
+        self._ahead(np.array([*state[:2], state[2] + error]))
+        if abs(error) > FACING:
+            self._retry_at = max(self._retry_at, self.robot.time + self.config.retry)
+        return float(np.clip(error, -self.config.scan_rate, self.config.scan_rate))
+
     def _look_along(self, path: Float[ndarray, "n 2"], state: ndarray) -> None:
         """Look at the floor where the path will lead, or ahead where it ends."""
         nearest = int(np.linalg.norm(path - state[:2], axis=1).argmin())
@@ -283,11 +321,19 @@ class ReplanningLoop:
             self._ahead(state)
             return
         target = path[nearest + int(np.searchsorted(along, self.config.look_ahead).clip(0, len(along) - 1))]
-        self.robot.look_at(np.array([*target, 0.3]))
+        self.robot.look_at(np.array([*target, self._height()]))
 
     def _ahead(self, state: ndarray) -> None:
+        """Look the way the base faces, and nearer where it looks down: to see where it could drive off."""
+        height = self._height()
+        distance = self.config.look_near if height <= 0 else self.config.look_ahead
         direction = np.array([math.cos(state[2]), math.sin(state[2])])
-        self.robot.look_at(np.array([*(state[:2] + self.config.look_ahead * direction), 0.3]))
+        self.robot.look_at(np.array([*(state[:2] + distance * direction), height]))
+
+    def _height(self) -> float:
+        """Where to look now between the heights that the camera nods between [m]."""
+        heights = self.config.look_heights
+        return heights[int(self.robot.time / self.config.nod) % len(heights)]
 
     def _end(self, status: DriveStatus, message: str) -> None:
         self.report.status, self.report.message = status, message

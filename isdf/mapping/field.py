@@ -7,11 +7,12 @@ from typing import Any, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Int8, UInt8
+from jaxtyping import Bool, Float, Int, Int8, UInt8
 from numba import njit
 from torch import Tensor
 
 from ..field import AnalyticField, check_points
+from .evidence import FREE_ABOVE
 from .lattice import BLOCK, CHUNK, FINE, STEP, LatticeArrays, node_at
 
 # Below this many points a second thread costs more than it saves.
@@ -29,6 +30,7 @@ class LatticeField(AnalyticField):
         confidence: of the same nodes, 255 is 1.
         block: of the same nodes: row of the cell's corrections, -1 where there are none.
         corrections: (n, 125) what trilinear interpolation misses at the fine nodes of a cell, in `lattice.STEP`s.
+        evidence: of the same nodes, see `isdf.mapping.evidence`.
         corner: (3,) lattice index of the first node.
         spacing: of coarse nodes [m].
         bounds: (2, 3) lower and upper corner of what was observed [m].
@@ -43,12 +45,13 @@ class LatticeField(AnalyticField):
         confidence: UInt8[np.ndarray, "rows 512"],
         block: Int[np.ndarray, "rows 512"],
         corrections: Int8[np.ndarray, "n 125"],
+        evidence: UInt8[np.ndarray, "rows 512"],
         corner: Int[np.ndarray, "3"],
         spacing: float,
         bounds: Float[Tensor, "2 3"],
     ) -> None:
         self._table, self._value, self._confidence = table, value, confidence
-        self._block, self._corrections = block, corrections
+        self._block, self._corrections, self._evidence = block, corrections, evidence
         self._origin, self.spacing = np.asarray(corner) * spacing, float(spacing)
         self.bounds = bounds.clone()
 
@@ -56,7 +59,7 @@ class LatticeField(AnalyticField):
     def nbytes(self) -> int:
         """Memory of all that queries need [bytes]."""
         rows = self._table[self._table >= 0]
-        nodes = sum(a.itemsize for a in (self._value, self._confidence, self._block)) * CHUNK**3
+        nodes = sum(a.itemsize for a in (self._value, self._confidence, self._block, self._evidence)) * CHUNK**3
         return self._table.nbytes + len(rows) * nodes + int((self._block[rows] >= 0).sum()) * BLOCK
 
     def distance_and_gradient(
@@ -79,6 +82,14 @@ class LatticeField(AnalyticField):
         out = np.empty(len(flat), np.float32)
         _confidence(flat, self._origin, self.spacing, self._table, self._confidence, out)
         return torch.from_numpy(out).to(points).view(points.shape[:-1])
+
+    def observed(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether space at a world point [m] was looked through: by the closest coarse node, False outside the map."""
+        check_points(points)
+        flat = points.detach().cpu().numpy().reshape(-1, 3)
+        out = np.empty(len(flat), np.bool_)
+        _observed(flat, self._origin, self.spacing, self._table, self._evidence, out)
+        return torch.from_numpy(out).to(points.device).view(points.shape[:-1])
 
     def _split(self, kernel: Any, points: np.ndarray, distance: np.ndarray, gradient: np.ndarray) -> None:
         """Run a kernel over the points in as many threads as torch uses."""
@@ -174,6 +185,19 @@ def _confidence(points, origin, spacing, table, confidence, out):
                     w = (tx if a else 1 - tx) * (ty if b else 1 - ty) * (tz if c else 1 - tz)
                     total += w * node_at(table, confidence, i + a, j + b, k + c, np.uint8(0))
         out[n] = total / 255
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _observed(points, origin, spacing, table, evidence, out):
+    """Whether the coarse node closest to each of points (n, 3) was looked through."""
+    last = (CHUNK * table.shape[0] - 1, CHUNK * table.shape[1] - 1, CHUNK * table.shape[2] - 1)
+    for n in range(points.shape[0]):
+        x = (points[n, 0] - origin[0]) / spacing + 0.5
+        y = (points[n, 1] - origin[1]) / spacing + 0.5
+        z = (points[n, 2] - origin[2]) / spacing + 0.5
+        inside = 0 <= x < last[0] + 1 and 0 <= y < last[1] + 1 and 0 <= z < last[2] + 1
+        out[n] = inside and node_at(table, evidence, int(x), int(y), int(z), np.uint8(0)) > FREE_ABOVE
 
 
 @njit(cache=True, nogil=True)

@@ -25,7 +25,7 @@ STEP = 0.0012
 CHUNK = 8
 # Most chunks that the box about the map may have room for, at four bytes each where nothing is.
 MAX_CHUNKS = 4_000_000
-# What is kept of a node: its type, and what holds where nothing was written. Snapshots read the first three.
+# What is kept of a node: its type, and what holds where nothing was written. Snapshots read those published.
 NODES: dict[str, tuple[Any, float]] = {
     "value": (np.float32, 1.0),
     "confidence": (np.uint8, 0.0),
@@ -34,7 +34,7 @@ NODES: dict[str, tuple[Any, float]] = {
     "share": (np.float16, 0.5),
     "width": (np.float16, -0.7),
 }
-PUBLISHED = ("value", "confidence", "block")
+PUBLISHED = ("value", "confidence", "block", "evidence")
 
 
 class LatticeArrays(NamedTuple):

@@ -159,6 +159,7 @@ class Mapper(ShownMapper):
             nodes["confidence"],
             nodes["block"],
             lattice.corrections,
+            nodes["evidence"],
             lattice.corner.copy(),
             lattice.spacing,
             self._bounds,
@@ -303,6 +304,7 @@ def compile_kernels() -> None:
     for dtype in (torch.float32, torch.float64):
         field.distance_and_gradient(torch.zeros(1, 3, dtype=dtype))
         field.confidence(torch.zeros(1, 3, dtype=dtype))
+        field.observed(torch.zeros(1, 3, dtype=dtype))
 
 
 def _intrinsics(frame: DepthFrame) -> tuple[float, float, float, float]:
