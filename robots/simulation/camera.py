@@ -117,8 +117,10 @@ class DepthCamera:
         self._next_time = world.time
         self._rays = self.camera.rays()
         self._frustum = self._frustum_normals()
-        self._static: tuple[tuple[Primitive, ...], RayCaster | None] | None = None
-        self._movable: dict[Primitive, RayCaster] = {}
+        self._joined: dict[str, Primitive] = {}
+        self._joined_caster: RayCaster | None = None
+        self._moved: set[str] = set()
+        self._shapes: dict[tuple[str, tuple[float, float, float]], RayCaster] = {}
         self._links: dict[str, RayCaster] | None = None if see_robot else {}
         self._scene_surface = self._read_scene()
         self.pose()
@@ -149,26 +151,30 @@ class DepthCamera:
     def _visible(self) -> Iterator[tuple[RayCaster, np.ndarray]]:
         """Every ray caster with the pose T_world_body of its frame."""
         solids = self.world.solids
-        fixed = tuple(solid for solid in solids.values() if solid.mass == 0)
-        if self._static is None or self._static[0] != fixed:
-            self._static = (fixed, self._static_caster(fixed))
-        if self._static[1] is not None:
-            yield self._static[1], np.eye(4)
+        self._join_what_stays(solids)
+        if self._joined_caster is not None:
+            yield self._joined_caster, np.eye(4)
         for name, solid in solids.items():
-            if solid.mass > 0:
-                if solid not in self._movable:
-                    self._movable[solid] = RayCaster(solid.local_mesh())
-                yield self._movable[solid], self.world.object_pose(name)
+            if name not in self._joined:
+                shape = (solid.kind, solid.parameters)
+                if shape not in self._shapes:
+                    self._shapes[shape] = RayCaster(solid.local_mesh())
+                yield self._shapes[shape], self.world.object_pose(name)
         if self.world.has_robot:
             if self._links is None:
                 self._links = self._robot_casters()
             yield from zip(self._links.values(), self.world.robot.link_poses(list(self._links)), strict=True)
 
-    def _static_caster(self, solids: tuple[Primitive, ...]) -> RayCaster | None:
-        meshes = [solid.mesh() for solid in solids]
+    def _join_what_stays(self, solids: dict[str, Primitive]) -> None:
+        """Cast static solids together with the scene, but for those that were moved once: they may move again."""
+        self._moved |= {name for name, solid in self._joined.items() if solids.get(name) is not solid}
+        stay = {name: s for name, s in solids.items() if s.mass == 0 and name not in self._moved}
+        if self._joined_caster is not None and stay.keys() == self._joined.keys():
+            return
+        meshes = [solid.mesh() for solid in stay.values()]
         if self._scene_surface is not None:
             meshes.append(self._scene_surface)
-        return RayCaster(joined(meshes)) if meshes else None
+        self._joined, self._joined_caster = stay, RayCaster(joined(meshes)) if meshes else None
 
     def _robot_casters(self) -> dict[str, RayCaster]:
         """One for each link with a surface, but for the camera's own housing, which it looks out of."""
