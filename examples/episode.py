@@ -17,8 +17,19 @@ from isdf.mapping.field import LatticeField
 from planning.clock import Clock, FixedClock, MeasuredClock
 from planning.collision_monitor import CollisionMonitor, Spheres
 from planning.protocols import DistanceField
-from robots.simulation import DepthNoise, Scene, SimulatedMobileRobot, World, load_urdf_scene, make_scene
+from robots.simulation import (
+    DepthNoise,
+    DepthNoiseConfig,
+    Scene,
+    SimulatedMobileRobot,
+    World,
+    load_urdf_scene,
+    make_scene,
+)
 
+# Range of the camera [m]; that of the Orbbec Astra on TIAGo's head. Where nothing is in range nothing is measured, and
+# what has gone from there stays in the map.
+CAMERA_RANGE = 8.0
 # The robot is lower than this [m]: space above it need not be baked for planning a path of the base.
 ROBOT_HEIGHT = 1.45
 
@@ -71,8 +82,10 @@ class Episode:
         q = self.model.named["tucked"].double().numpy().copy()
         q[:3] = start
         self.world = World(self.scene)
-        noise = DepthNoise() if options.noise else None
-        simulated = SimulatedMobileRobot(self.world, self.model, q, noise=noise, seed=options.seed)
+        noise = DepthNoise(DepthNoiseConfig(max_range=CAMERA_RANGE)) if options.noise else None
+        simulated = SimulatedMobileRobot(
+            self.world, self.model, q, noise=noise, seed=options.seed, max_range=CAMERA_RANGE
+        )
         self.robot = DisturbedRobot(simulated, disturbances)
         self.body = robots.SweptBase(self.model, torch.as_tensor(q, dtype=torch.float32))
         self.mapper = new_map(options.method, options.seed, self.world)

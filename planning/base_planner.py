@@ -32,6 +32,7 @@ class BasePlannerConfig:
         clearance_change: a plan is no longer good when the map has taken this much [m] of its clearance.
         off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
         looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
+        memory: blocked space is given another chance after this long [s], for the world changes.
         stood: unknown space this near [m] to where the base has stood counts as seen: a camera on the robot cannot see
             it, and the robot was there.
     """
@@ -40,18 +41,19 @@ class BasePlannerConfig:
     # least margin.
     search: GridSearchConfig = field(
         default_factory=lambda: GridSearchConfig(
-            least_margin=-0.05,
+            least_margin=0.0,
             through_blocked=30.0,
             through_unknown=2.0,
             workspace=WorkspaceConfig(unknown_confidence=0.5),
         )
     )
-    chomp: ChompConfig = field(default_factory=lambda: ChompConfig(eps=0.35, max_iterations=120))
+    chomp: ChompConfig = field(default_factory=lambda: ChompConfig(eps=0.35, max_iterations=120, restarts=0))
     num_waypoints: int = 40
     margin: float = 0.05
     clearance_change: float = 0.05
     off_path: float = 0.25
     looks: int = 3
+    memory: float = 30.0
     stood: float = 0.5
 
     def __post_init__(self) -> None:
@@ -75,14 +77,14 @@ class BasePlan:
         result: the path with its verdict.
         reaches_goal: whether it leads to the goal, or only nearer to it.
         dead_end: whether it leads nowhere, because the robot stands where it ends already.
-        entry: where it would go on through unknown or blocked space [m], and what is to be looked at; None if it
+        onward: (m, 2) how it would go on through unknown or blocked space [m]: what is to be looked at. Empty if it
             reaches the goal or no way leads there.
     """
 
     result: PlanResult
     reaches_goal: bool
     dead_end: bool
-    entry: Float[Tensor, "2"] | None = None
+    onward: Float[Tensor, "m 2"]
 
     @property
     def usable(self) -> bool:
@@ -111,7 +113,7 @@ class BasePlanner:
 
     def __init__(self, body: SphereRobot, config: BasePlannerConfig | None = None, seed: int = 0) -> None:
         self.body, self.config, self.seed = body, config or BasePlannerConfig(), seed
-        self._entries: list[Tensor] = []
+        self._entries: list[tuple[float, Tensor]] = []
         self._trail: list[Tensor] = []
 
     def forget(self) -> None:
@@ -125,15 +127,29 @@ class BasePlanner:
 
     @one_thread
     def plan(
-        self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField, route: Route | None = None
+        self,
+        start: Float[Tensor, "2"],
+        goal: Float[Tensor, "2"],
+        sdf: DistanceField,
+        route: Route | None = None,
+        now: float = 0.0,
     ) -> BasePlan:
-        """Plan from start to goal [m], through seen space, along `route` if it is known; a dead end is remembered."""
+        """Plan from start to goal [m], through seen space; a dead end is remembered.
+
+        Args:
+            start: where the base stands [m].
+            goal: where it is to go [m].
+            sdf: the map.
+            route: the way from start to goal, if it was searched already.
+            now: time [s], to know how old a dead end is.
+        """
+        self._entries = [(when, place) for when, place in self._entries if now - when < self.config.memory]
         route = route or self.route(start, goal, sdf)
         result = self._optimised(route, self._explored(sdf))
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
-            self._entries.append(route.entry)
-        return BasePlan(result, route.reaches_goal, dead_end, route.entry)
+            self._entries.append((now, route.entry))
+        return BasePlan(result, route.reaches_goal, dead_end, route.onward)
 
     def route(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField) -> Route:
         """The way that `plan` would start from."""
@@ -198,7 +214,7 @@ class BasePlanner:
         """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
         if not self._entries:
             return None
-        entries = torch.stack(self._entries)
+        entries = torch.stack([place for _, place in self._entries])
         visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
         return entries[visits >= self.config.looks]
 

@@ -67,12 +67,18 @@ class Route:
         path: (k, 2) positions [m] from the start to the goal; or to where blocked space would have to be entered; or
             to the reachable place nearest to the goal.
         reaches_goal: whether it ends at the goal.
-        entry: (2,) the blocked position that comes next [m], if the path ends before one.
+        onward: (m, 2) how it would go on to the goal through blocked space [m]; empty where it reaches the goal or no such
+            way is left.
     """
 
     path: Float[Tensor, "k 2"]
     reaches_goal: bool
-    entry: Float[Tensor, "2"] | None = None
+    onward: Float[Tensor, "m 2"]
+
+    @property
+    def entry(self) -> Float[Tensor, "2"] | None:
+        """The blocked position (2,) that comes next [m], if the path ends before one."""
+        return self.onward[0] if len(self.onward) else None
 
 
 def grid_search(
@@ -109,17 +115,18 @@ def grid_search(
     cells, reach = _cheapest(cost, shape, config.spacing, near_start, near_goal)
     if cells:
         path = torch.cat([start[None], positions[cells][1:-1], goal[None]])
-        return Route(path, True)
+        return Route(path, True, path[:0])
     if closed is not None and len(closed):
         near = torch.cdist(positions, closed).amin(dim=1) <= config.closed_radius
         price = price.masked_fill(torch.isinf(cost) & near, torch.inf)
     cells, _ = _cheapest(price, shape, config.spacing, near_start, near_goal)
     if cells:
         first = int(torch.isinf(cost[cells]).float().argmax())
-        return Route(torch.cat([start[None], positions[cells[1:first]]]), False, positions[cells[first]])
+        path = torch.cat([start[None], positions[cells[1:first]]])
+        return Route(path, False, positions[cells[first:]])
     gap = (positions - goal).norm(dim=1).masked_fill(~torch.isfinite(torch.as_tensor(reach)), torch.inf)
     cells, _ = _cheapest(cost, shape, config.spacing, near_start, int(gap.argmin()))
-    return Route(torch.cat([start[None], positions[cells][1:]]), False)
+    return Route(torch.cat([start[None], positions[cells][1:]]), False, positions[:0])
 
 
 def _cheapest(

@@ -122,7 +122,7 @@ class ReplanningLoop:
         self._failures, self._failed_at = 0, np.full(2, math.inf)
         self._retry_at = -math.inf
         self._to_goal = False
-        self._entry: np.ndarray | None = None
+        self._onward = np.empty((0, 2))
         self._mapped = False
 
     def drive_to(self, goal: Float[ndarray, "2"], final_yaw: float | None = None) -> DriveReport:
@@ -219,9 +219,9 @@ class ReplanningLoop:
             route = self.planner.route(start, end, self.field)
             if not self.tracker.finished and not self._leads_on(route):
                 return self.plan
-        fresh = self.planner.plan(start, end, self.field, route)
+        fresh = self.planner.plan(start, end, self.field, route, self.robot.time)
         self.report.plans += 1
-        self._entry = None if fresh.entry is None else fresh.entry.numpy().astype(float)
+        self._onward = fresh.onward.numpy().astype(float)
         if fresh.usable:
             # A plan that the base cannot begin to follow is as good as none.
             gone = float(np.linalg.norm(self.robot.base_state()[:2] - self._failed_at))
@@ -240,7 +240,7 @@ class ReplanningLoop:
     def _follow(self, duration: float, final_yaw: float | None) -> None:
         """Let time pass on the plan; without one, turn on the spot to see more."""
         if self.plan is None:
-            turn = self._turn_to_entry(self.robot.base_state())
+            turn = self._turn_onward(self.robot.base_state())
             self._pass_time(duration, lambda _: (0.0, turn))
             return
         path = self.plan.trajectory.waypoints.numpy().astype(float)
@@ -298,15 +298,16 @@ class ReplanningLoop:
         self.report.note(self.robot.time - self._started, reason)
         logger.info("no plan: %s", reason)
 
-    def _turn_to_entry(self, state: ndarray) -> float:
-        """Look at where the way would go on, if there is such a place, and else around; returns the turning rate.
+    def _turn_onward(self, state: ndarray) -> float:
+        """Look along where the way would go on, if there is one, and else around; returns the turning rate.
 
-        The next attempt waits until the camera faces that place.
+        The next attempt waits until the camera faces that way.
         """
-        if self._entry is None:
+        far = self._onward[np.linalg.norm(self._onward - state[:2], axis=1) > self.config.look_near]
+        if len(far) == 0:
             self._ahead(state)
             return self.config.scan_rate
-        away = self._entry - state[:2]
+        away = far[0] - state[:2]
         error = math.remainder(math.atan2(away[1], away[0]) - state[2], 2 * math.pi)
         self._ahead(np.array([*state[:2], state[2] + error]))
         if abs(error) > FACING:

@@ -9,19 +9,29 @@ from __future__ import annotations
 from typing import no_type_check
 
 import numpy as np
+from jaxtyping import Float
 from numba import njit
+from scipy.ndimage import minimum_filter
 
 from .bricks import Bricks
 
 # Nearer than this [m] the noise of depth cameras no longer falls with the square of the depth.
 NOISE_FLOOR_DEPTH = 0.5
-# Contradicted evidence counts as much as this many views like the one that contradicts it.
-TRUST = 8.0
+# Contradicted evidence counts as much as this many views like the one that contradicts it: fewer where all rays around
+# go on far behind it, which is not the frayed edge of something that is still there.
+TRUST, TRUST_SEEN_THROUGH = 8.0, 1.0
+# How far around, as the tangent of an angle, and how far behind, in truncations.
+AROUND, FAR_BEHIND = 0.015, 1.5
+
+
+def nearest_around(depth: Float[np.ndarray, "h w"], focal: float) -> Float[np.ndarray, "h w"]:
+    """The least depth [m] around every pixel, 0 where one of them has none; `focal` is the focal length [px]."""
+    return minimum_filter(depth, size=2 * max(1, round(AROUND * focal)) + 1, mode="nearest")
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def fuse(bricks: Bricks, begin, end, depth, noise, least, max_weight, intrinsics, T_camera_world):
+def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, intrinsics, T_camera_world):
     """Average one depth image into the stored voxels of a box of bricks, in place.
 
     Args:
@@ -29,6 +39,7 @@ def fuse(bricks: Bricks, begin, end, depth, noise, least, max_weight, intrinsics
         begin: (3,) first brick of the box, as array index.
         end: (3,) one past its last.
         depth: (h, w) float32 z-depth [m], 0 = unknown.
+        around: (h, w) float32, `nearest_around` of it.
         noise: truncation per squared depth.
         least: least truncation [m].
         max_weight: limit of a voxel's weight.
@@ -90,8 +101,9 @@ def fuse(bricks: Bricks, begin, end, depth, noise, least, max_weight, intrinsics
                             at = i * 64 + j * 8 + k
                             old, before = distances[brick, at], weights[brick, at]
                             value = min(ahead, band)
-                            if abs(value - old) > 0.75 * band and before > TRUST * weight:
-                                before = TRUST * weight
+                            if abs(value - old) > 0.75 * band:
+                                through = around[v, u] - z > FAR_BEHIND * band
+                                before = min(before, (TRUST_SEEN_THROUGH if through else TRUST) * weight)
                             total = before + weight
                             distances[brick, at] = (old * before + value * weight) / total
                             weights[brick, at] = min(total, max_weight)

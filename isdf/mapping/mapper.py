@@ -27,7 +27,7 @@ from .completion import load_network
 from .config import MapperConfig
 from .evidence import look_through
 from .field import LatticeField
-from .fusion import fuse
+from .fusion import fuse, nearest_around
 from .lattice import Lattice
 from .motion import Moment, Motion
 from .refresh import guess, refresh
@@ -264,7 +264,8 @@ class Mapper(ShownMapper):
         sparse = max(1, int(4 * config.voxel * frame.camera.fx / config.max_depth))
         bricks.add(missing_bricks(bricks.arrays, depth, sparse, *band, intrinsics, T))
         inverse = np.linalg.inv(T)
-        fuse(bricks.arrays, *bricks.box(*box), depth, *band, config.max_weight, intrinsics, inverse)
+        around = nearest_around(depth, frame.camera.fx)
+        fuse(bricks.arrays, *bricks.box(*box), depth, around, *band, config.max_weight, intrinsics, inverse)
         begin, end = lattice.window(*box)
         evidence = lattice.read("evidence", begin, end)
         first, size = lattice.corner + begin, end - begin
