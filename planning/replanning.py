@@ -50,7 +50,7 @@ class ReplanningConfig:
         look_heights: heights [m] there between which it nods: no view is wide enough to see both what stands on the
             floor and what hangs as high as the robot's head.
         nod: time [s] at each of them.
-        extend: a plan that ends before unknown space is made anew when the map would lead this much [m] on.
+        extend: a plan that ends before unknown space is made anew when this much [m] less of the way is unknown.
         stuck: the plan is given up when the collision monitor has held the base for this long [s].
         patience: plans that may fail, or not be followed, without progress before the goal is called unreachable.
         time_limit: [s] of the robot's time.
@@ -232,10 +232,9 @@ class ReplanningLoop:
         return None
 
     def _leads_on(self, route: Route) -> bool:
-        """Whether a route gets further than the plan that is followed, which ends before the goal."""
-        assert self.plan is not None
-        ends = route.path[-1], self.plan.trajectory.waypoints[-1]
-        return route.reaches_goal or float((ends[0] - ends[1]).norm()) > self.config.extend
+        """Whether a route leaves less of the way unknown than the plan that is followed, which ends before the goal."""
+        left = _length(self._onward) - _length(route.onward.numpy().astype(float))
+        return route.reaches_goal or left > self.config.extend
 
     def _follow(self, duration: float, final_yaw: float | None) -> None:
         """Let time pass on the plan; without one, turn on the spot to see more."""
@@ -339,3 +338,8 @@ class ReplanningLoop:
     def _end(self, status: DriveStatus, message: str) -> None:
         self.report.status, self.report.message = status, message
         logger.info("drive ended: %s (%s)", status.value, message)
+
+
+def _length(path: Float[ndarray, "n 2"]) -> float:
+    """Length of a polyline [m]."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
