@@ -33,15 +33,12 @@ class BasePlannerConfig:
         off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
         looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
         memory: blocked space is given another chance after this long [s], for the world changes.
-        stood: unknown space this near [m] to where the base has stood counts as seen: a camera on the robot cannot see
-            it, and the robot was there.
+        room: unknown space this near [m] to the axis of the base, where it was put down, counts as free: a camera on
+            the robot does not see the floor round its feet. Later on only the space that the base has been in does.
     """
 
-    # A map still being learned is some centimetres wrong, and the robot stands where it stands: hence the negative
-    # least margin.
     search: GridSearchConfig = field(
         default_factory=lambda: GridSearchConfig(
-            least_margin=0.0,
             through_blocked=30.0,
             through_unknown=2.0,
             workspace=WorkspaceConfig(unknown_confidence=0.5),
@@ -54,18 +51,18 @@ class BasePlannerConfig:
     off_path: float = 0.25
     looks: int = 3
     memory: float = 30.0
-    stood: float = 0.5
+    room: float = 0.5
 
     def __post_init__(self) -> None:
         low = self.num_waypoints < 3 or self.looks < 1
         if (
             low
-            or not min(self.clearance_change, self.off_path) > 0
+            or not min(self.clearance_change, self.off_path, self.memory, self.room) > 0
             or not self.margin >= self.search.least_margin
         ):
             raise ConfigError(
-                "BasePlannerConfig: clearance_change and off_path must be positive, num_waypoints at least 3, looks at "
-                f"least 1 and margin at least search.least_margin, got {self}."
+                "BasePlannerConfig: clearance_change, off_path, memory and room must be positive, num_waypoints at least "
+                f"3, looks at least 1 and margin at least search.least_margin, got {self}."
             )
 
 
@@ -114,7 +111,9 @@ class BasePlanner:
     def __init__(self, body: SphereRobot, config: BasePlannerConfig | None = None, seed: int = 0) -> None:
         self.body, self.config, self.seed = body, config or BasePlannerConfig(), seed
         self._entries: list[tuple[float, Tensor]] = []
-        self._trail: list[Tensor] = []
+        self._trodden: list[Tensor] = []
+        centres, _ = body.spheres(torch.zeros(2))
+        self._reach = float(centres[:, :2].norm(dim=1).max()) + 0.5 * self.config.search.spacing
 
     def forget(self) -> None:
         """Forget the dead ends, for another goal."""
@@ -122,8 +121,10 @@ class BasePlanner:
 
     def stood(self, position: Float[Tensor, "2"]) -> None:
         """Take note that the base has been at a position [m]: space there is free, whether or not it was seen."""
-        if not self._trail or (self._trail[-1] - position).norm() > 0.25 * self.config.stood:
-            self._trail.append(position)
+        if not self._trodden:
+            self._trodden.append(torch.cat([position, position.new_tensor([self.config.room])]))
+        if (self._trodden[-1][:2] - position).norm() > 0.5 * self.config.search.spacing:
+            self._trodden.append(torch.cat([position, position.new_tensor([self._reach])]))
 
     @one_thread
     def plan(
@@ -169,7 +170,7 @@ class BasePlanner:
     def _explored(self, sdf: DistanceField) -> DistanceField:
         """The field with what it has not seen as unknown; the field itself where it does not tell."""
         if isinstance(sdf, ObservingField | ConfidentField):
-            return ExploredField(sdf, torch.stack(self._trail), self.config.stood)
+            return ExploredField(sdf, torch.stack(self._trodden))
         return sdf
 
     def _optimised(self, route: Route, sdf: DistanceField) -> PlanResult:

@@ -13,29 +13,29 @@ from planning.protocols import ConfidentField, ObservingField
 
 # From this confidence on a place counts as seen, in maps that say no more of it.
 SEEN = 0.5
-# The trail is kept on a grid of this spacing [m].
+# What is trodden is kept on a grid of this spacing [m].
 CELL = 0.05
 
 
 class ExploredField:
     """A distance field with confidence 1 where the base may drive and 0 in space nobody has looked at.
 
-    A camera on the robot never sees the space that the robot stands in, but the robot does stand there; so what is near
-    to its trail counts as seen.
+    A camera on the robot never sees the space that the robot stands in, but the robot does stand there; so its trail
+    counts as seen.
 
     Args:
         field: distances; it tells what was seen by `observed`, or else by `confidence`.
-        trail: (n, 2) positions where the base has been [m], at least one.
-        reach: radius [m] about the trail that counts as seen.
+        trodden: (n, 3) discs in plan that count as seen, at least one: x, y and radius [m].
     """
 
-    def __init__(self, field: ObservingField | ConfidentField, trail: Float[Tensor, "n 2"], reach: float) -> None:
+    def __init__(self, field: ObservingField | ConfidentField, trodden: Float[Tensor, "n 3"]) -> None:
         self.field = field
-        low, high = trail.amin(dim=0) - reach, trail.amax(dim=0) + reach
-        axes = [torch.arange(float(low[i]), float(high[i]) + CELL, CELL, dtype=trail.dtype) for i in (0, 1)]
+        middle, radius = trodden[:, :2], trodden[:, 2:]
+        low, high = (middle - radius).amin(dim=0), (middle + radius).amax(dim=0)
+        axes = [torch.arange(float(low[i]), float(high[i]) + CELL, CELL, dtype=trodden.dtype) for i in (0, 1)]
         grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-        near = torch.cdist(grid.view(-1, 2), trail).amin(dim=1) <= reach
-        self._low, self._trodden = low.numpy(), near.view(grid.shape[:2]).numpy()
+        inside = (torch.cdist(grid.view(-1, 2), middle) <= radius.T).any(dim=1)
+        self._low, self._trodden = low.numpy(), inside.view(grid.shape[:2]).numpy()
 
     def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Signed distances [m] of the field."""
@@ -48,9 +48,9 @@ class ExploredField:
         return self.field.distance_and_gradient(points)
 
     def confidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """1 where a point [m] was looked at or lies near the trail, else 0."""
+        """1 where a point [m] was looked at or is trodden, else 0."""
         seen = self._observed(points).cpu().numpy().ravel()
-        _add_trail(points.detach().cpu().numpy().reshape(-1, 3), self._low, self._trodden, seen)
+        _add_trodden(points.detach().cpu().numpy().reshape(-1, 3), self._low, self._trodden, seen)
         return torch.from_numpy(seen).to(points).view(points.shape[:-1])
 
     def _observed(self, points: Tensor) -> Bool[Tensor, "*batch"]:
@@ -61,7 +61,7 @@ class ExploredField:
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _add_trail(points, low, trodden, seen):
+def _add_trodden(points, low, trodden, seen):
     """Set `seen` (n,) where points (n, 3) [m] lie in trodden cells of a grid in plan that begins at `low` [m]."""
     for n in range(points.shape[0]):
         x, y = (points[n, 0] - low[0]) / CELL + 0.5, (points[n, 1] - low[1]) / CELL + 0.5

@@ -76,6 +76,12 @@ class ReplanningConfig:
                 "ReplanningConfig: scan_rate, retry, stuck and time_limit must be positive, got "
                 f"{self.scan_rate:g} rad/s, {self.retry:g} s, {self.stuck:g} s and {self.time_limit:g} s."
             )
+        if not self.look_heights or not min(self.look_ahead, self.look_near, self.nod, self.extend) > 0:
+            raise ConfigError(
+                "ReplanningConfig: look_heights must not be empty, and look_ahead, look_near, nod and extend must be "
+                f"positive, got {self.look_heights}, {self.look_ahead:g} m, {self.look_near:g} m, {self.nod:g} s and "
+                f"{self.extend:g} m."
+            )
 
 
 class ReplanningLoop:

@@ -59,7 +59,9 @@ class LatticeField(AnalyticField):
     def nbytes(self) -> int:
         """Memory of all that queries need [bytes]."""
         rows = self._table[self._table >= 0]
-        nodes = sum(a.itemsize for a in (self._value, self._confidence, self._block, self._evidence)) * CHUNK**3
+        nodes = (
+            sum(a.itemsize for a in (self._value, self._confidence, self._block, self._evidence)) * CHUNK**3
+        )
         return self._table.nbytes + len(rows) * nodes + int((self._block[rows] >= 0).sum()) * BLOCK
 
     def distance_and_gradient(

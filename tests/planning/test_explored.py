@@ -1,0 +1,166 @@
+"""Space that nobody has looked at is not driven into."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from planning.base_planner import BasePlanner, BasePlannerConfig
+from planning.drive import DriveStatus
+from planning.explored import ExploredField
+from planning.protocols import ObservingField
+from planning.replanning import ReplanningLoop
+from tests.planning.fields import AutogradField, Box, Confident
+from tests.planning.test_replanning import BODY, FREE, QUICK, drive
+from tests.planning.unicycles import Unicycle
+
+START = torch.zeros(2)
+TRAIL = torch.tensor([[0.0, 0.0, 0.5], [1.0, 0.0, 0.45]])
+
+
+@dataclass
+class Observed(AutogradField):
+    """A field of which only what is near to some places was looked at."""
+
+    field: AutogradField
+    places: Tensor
+    reach: float
+
+    def distance(self, points: Tensor) -> Tensor:
+        return self.field.distance(points)
+
+    def observed(self, points: Tensor) -> Tensor:
+        return (
+            torch.cdist(points.reshape(-1, 3)[:, :2].float(), self.places).amin(dim=1).view(points.shape[:-1])
+            <= self.reach
+        )
+
+
+def test_known_is_what_was_looked_at_and_where_the_base_has_been() -> None:
+    seen = Observed(FREE, torch.tensor([[5.0, 0.0]]), 1.0)
+    assert isinstance(seen, ObservingField)
+    explored = ExploredField(seen, TRAIL)
+    at = torch.tensor(
+        [[5.5, 0.0, 0.3], [0.0, 0.4, 9.0], [1.4, 0.0, 0.1], [0.52, 0.3, 0.1], [1.6, 0.0, 0.1], [-3, 9, 0.0]]
+    )
+    assert explored.confidence(at).tolist() == [1, 1, 1, 0, 0, 0]
+    assert explored.confidence(at.view(2, 3, 3)).shape == (2, 3)
+    assert torch.equal(explored.distance(at), FREE.distance(at))
+    assert torch.equal(explored.distance_and_gradient(at)[1], FREE.distance_and_gradient(at)[1])
+
+
+def test_a_confidence_tells_as_well_what_was_looked_at() -> None:
+    explored = ExploredField(Confident(FREE, 2.0), TRAIL)
+    assert explored.confidence(torch.tensor([[1.9, 3.0, 0.0], [2.1, 3.0, 0.0]])).tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("seen", [Observed(FREE, torch.zeros(1, 2), 1.0), Confident(FREE, 1.0)])
+def test_a_plan_ends_before_space_that_was_not_looked_at(seen) -> None:
+    plan = BasePlanner(BODY).plan(START, torch.tensor([3.0, 0.0]), seen)
+    assert plan.usable and not plan.reaches_goal
+    ends = plan.result.trajectory.waypoints
+    centres, _ = BODY.spheres(ends)
+    assert bool(ExploredField(seen, torch.tensor([[0.0, 0.0, 0.5]])).confidence(centres).all())
+    assert 0.7 < float(ends[-1, 0]) <= 1.0
+    torch.testing.assert_close(plan.onward[-1], torch.tensor([3.0, 0.0]), atol=0.06, rtol=0)
+
+
+def test_a_seen_detour_is_taken_rather_than_a_short_cut_that_was_not_seen() -> None:
+    way = torch.tensor([[0.0, 0.0], [0.0, 1.0], [1.0, 1.5], [2.0, 1.5], [3.0, 1.0], [3.0, 0.0]])
+    points = torch.cat(
+        [a + torch.linspace(0, 1, 20)[:, None] * (b - a) for a, b in zip(way[:-1], way[1:], strict=True)]
+    )
+    plan = BasePlanner(BODY).plan(START, torch.tensor([3.0, 0.0]), Observed(FREE, points, 0.4))
+    assert plan.usable and plan.reaches_goal
+    assert float(plan.result.trajectory.waypoints[:, 1].max()) > 0.9
+
+
+def test_a_field_that_does_not_tell_is_taken_at_its_word() -> None:
+    assert BasePlanner(BODY).plan(START, torch.tensor([3.0, 0.0]), FREE).reaches_goal
+
+
+def test_dead_ends_are_tried_again_after_a_while() -> None:
+    planner = BasePlanner(BODY, BasePlannerConfig(memory=30.0))
+    wall, goal = Box((0.6, 0.0, 0.5), (0.3, 30.0, 1.0)), torch.tensor([3.0, 0.0])
+    for now in range(10):
+        plan = planner.plan(START, goal, wall, now=float(now))
+    closed = [
+        len(planner.plan(START, goal, wall, now=now).onward) and float(plan.onward[0, 1])
+        for now in (10.0, 60.0)
+    ]
+    fresh = BasePlanner(BODY).plan(START, goal, wall).onward
+    again = planner.plan(START, goal, wall, now=200.0).onward
+    assert closed[0] != float(fresh[0, 1]), "closed for now"
+    torch.testing.assert_close(again, fresh)
+
+
+def test_the_robot_drives_only_where_it_has_looked_and_still_arrives() -> None:
+    robot, looked = Unicycle(), []
+
+    def knows():
+        # It sees a disc about a metre ahead, wherever it was.
+        x, y, yaw = robot.state
+        looked.append([x + math.cos(yaw), y + math.sin(yaw)])
+        return Observed(FREE, torch.tensor(looked, dtype=torch.float32), 0.9)
+
+    plans = []
+
+    def watch(loop: ReplanningLoop) -> None:
+        if loop.plan is not None:
+            centres, _ = BODY.spheres(loop.plan.trajectory.waypoints)
+            trail = torch.tensor(np.array(robot.states)[::20, :2], dtype=torch.float32)
+            trodden = torch.cat([trail, torch.full((len(trail), 1), 0.16)], dim=1)
+            trodden[0, 2] = 0.56
+            plans.append(bool(ExploredField(loop.field, trodden).confidence(centres).all()))
+
+    loop, report = drive(robot, knows, replace(QUICK, planner=BasePlannerConfig()), watch=watch)
+    assert report.success and len(plans) > 5 and all(plans)
+    assert report.plans > 2, "the way was seen piece by piece"
+    assert report.failed_plans == 0, "it did not have to stop for that"
+
+
+def test_what_can_never_be_seen_is_given_up() -> None:
+    robot = Unicycle()
+    _, report = drive(
+        robot, Observed(FREE, torch.zeros(1, 2), 1.2), replace(QUICK, planner=BasePlannerConfig())
+    )
+    assert report.status is DriveStatus.UNREACHABLE and report.message
+    assert np.abs(np.array(robot.states)[:, :2]).max() < 1.3, "it did not creep on"
+
+
+def test_before_a_dead_end_it_turns_to_where_the_way_would_go_on() -> None:
+    goal = np.array([-3.0, 0.0])  # behind it
+    robot = Unicycle()
+    loop, _ = drive(
+        robot,
+        Observed(FREE, torch.zeros(1, 2), 0.3),
+        replace(QUICK, planner=BasePlannerConfig(), time_limit=9.0),
+        goal=goal,
+    )
+    assert abs(math.remainder(robot.state[2] - math.pi, 2 * math.pi)) < 0.4
+    assert robot.looked_at[-1][0] < robot.state[0]
+
+
+def test_the_camera_nods() -> None:
+    robot = Unicycle()
+    drive(robot, FREE)
+    heights = np.array(robot.looked_at)[:, 2]
+    assert set(heights.tolist()) == set(QUICK.look_heights)
+    assert np.flatnonzero(np.diff(heights)).size > 4
+
+
+@pytest.mark.parametrize("values", [{"nod": 0.0}, {"look_heights": ()}, {"extend": 0.0}, {"look_near": 0.0}])
+def test_bad_ways_of_looking_are_refused(values: dict) -> None:
+    with pytest.raises(Exception, match=next(iter(values))):
+        replace(QUICK, **values)
+
+
+@pytest.mark.parametrize("values", [{"room": 0.0}, {"memory": -1.0}])
+def test_bad_memories_are_refused(values: dict) -> None:
+    with pytest.raises(Exception, match=next(iter(values))):
+        BasePlannerConfig(**values)
