@@ -61,8 +61,8 @@ class BasePlannerConfig:
             or not self.margin >= self.search.least_margin
         ):
             raise ConfigError(
-                "BasePlannerConfig: clearance_change, off_path, memory and room must be positive, num_waypoints at least "
-                f"3, looks at least 1 and margin at least search.least_margin, got {self}."
+                "BasePlannerConfig: clearance_change, off_path, memory and room must be positive, num_waypoints at "
+                f"least 3, looks at least 1 and margin at least search.least_margin, got {self}."
             )
 
 

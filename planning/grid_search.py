@@ -67,8 +67,8 @@ class Route:
         path: (k, 2) positions [m] from the start to the goal; or to where blocked space would have to be entered; or
             to the reachable place nearest to the goal.
         reaches_goal: whether it ends at the goal.
-        onward: (m, 2) how it would go on to the goal through blocked space [m]; empty where it reaches the goal or no such
-            way is left.
+        onward: (m, 2) how it would go on to the goal through blocked space [m]; empty where it reaches the goal or no
+            such way is left.
     """
 
     path: Float[Tensor, "k 2"]

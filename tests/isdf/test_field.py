@@ -170,3 +170,21 @@ def test_a_balls_mesh_has_its_volume_and_faces_outward() -> None:
         mesh.visual.vertex_colors[upward, 0].min()
         > mesh.visual.vertex_colors[mesh.vertices[:, 2] < -0.45, 0].max()
     )
+
+
+def test_a_baked_field_is_as_confident_as_the_one_it_was_baked_from():
+    class Half:
+        def distance(self, points: torch.Tensor) -> torch.Tensor:
+            return points[..., 2]
+
+        def confidence(self, points: torch.Tensor) -> torch.Tensor:
+            return (points[..., 0] > 0).to(points)
+
+    bounds = torch.tensor([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+    baked = bake(Half(), bounds, 0.1)
+    at = torch.tensor([[0.5, 0.0, 0.5], [-0.5, 0.0, 0.5], [0.5, 0.0, 9.0]])
+    assert baked.confidence(at).tolist() == [1, 0, 0]
+    assert baked.confidence(at.view(3, 1, 3)).shape == (3, 1)
+    again = bake(baked, bounds, 0.1)
+    torch.testing.assert_close(again.confidence(at), baked.confidence(at))
+    assert not hasattr(bake(GridField(torch.rand(4, 4, 4), torch.zeros(3), 0.1), bounds, 0.5), "confidence")

@@ -320,3 +320,30 @@ def test_the_command_line_maps_with_it_by_default(tmp_path, monkeypatch):
         np.isfinite(answer["distance"]).all()
         and ((answer["confidence"] >= 0) & (answer["confidence"] <= 1)).all()
     )
+
+
+def test_four_views_through_it_are_enough_for_what_has_gone():
+    obstacle, mapper = box((-0.6, -0.9, 1.0), (0.3, 0.3, 0.5)), Mapper()  # hangs in mid-air, in full view
+    now = watch(mapper, scene(obstacle), 0.0, 2.0)
+    inside = torch.tensor([-0.6, -0.9, 1.0]) + 0.25 * (
+        torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    )
+    assert mapper.field().distance(inside).mean() < 0.1
+    watch(mapper, scene(), now, 1.0, fps=4)
+    mapper.refresh()
+    assert (mapper.field().distance(inside) - scene()(inside)).abs().mean() < 0.1
+
+
+def test_it_knows_what_was_looked_through():
+    mapper = Mapper()
+    watch(mapper, scene(), 0.0, 1.0)
+    field = mapper.field()
+    places = torch.tensor(
+        [[-1.0, -1.0, 1.0], [0.0, 0.0, 0.6], [-1.6, -1.5, 2.3], [-1.6, -2.4, 0.5], [0.0, 0.0, 30.0]]
+    )
+    assert field.observed(places).tolist() == [True, True, False, False, False]
+    assert torch.equal(field.observed(places.view(1, 5, 3)), field.observed(places)[None])
+    assert field.observed(places.double()).dtype == torch.bool
+    mapper.integrate(render(scene(), look_at((-1.6, -1.5, 1.3), (-1.5, -1.5, 3.0)), CAMERA, 2.5))
+    assert mapper.field().observed(places).tolist() == [True, True, True, False, False]
+    assert field.observed(places).tolist() == [True, True, False, False, False], "a snapshot does not change"

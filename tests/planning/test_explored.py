@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -72,9 +73,7 @@ def test_a_plan_ends_before_space_that_was_not_looked_at(seen) -> None:
 
 def test_a_seen_detour_is_taken_rather_than_a_short_cut_that_was_not_seen() -> None:
     way = torch.tensor([[0.0, 0.0], [0.0, 1.0], [1.0, 1.5], [2.0, 1.5], [3.0, 1.0], [3.0, 0.0]])
-    points = torch.cat(
-        [a + torch.linspace(0, 1, 20)[:, None] * (b - a) for a, b in zip(way[:-1], way[1:], strict=True)]
-    )
+    points = torch.cat([a + torch.linspace(0, 1, 20)[:, None] * (b - a) for a, b in itertools.pairwise(way)])
     plan = BasePlanner(BODY).plan(START, torch.tensor([3.0, 0.0]), Observed(FREE, points, 0.4))
     assert plan.usable and plan.reaches_goal
     assert float(plan.result.trajectory.waypoints[:, 1].max()) > 0.9
@@ -118,7 +117,7 @@ def test_the_robot_drives_only_where_it_has_looked_and_still_arrives() -> None:
             trodden[0, 2] = 0.56
             plans.append(bool(ExploredField(loop.field, trodden).confidence(centres).all()))
 
-    loop, report = drive(robot, knows, replace(QUICK, planner=BasePlannerConfig()), watch=watch)
+    _loop, report = drive(robot, knows, replace(QUICK, planner=BasePlannerConfig()), watch=watch)
     assert report.success and len(plans) > 5 and all(plans)
     assert report.plans > 2, "the way was seen piece by piece"
     assert report.failed_plans == 0, "it did not have to stop for that"
@@ -136,7 +135,7 @@ def test_what_can_never_be_seen_is_given_up() -> None:
 def test_before_a_dead_end_it_turns_to_where_the_way_would_go_on() -> None:
     goal = np.array([-3.0, 0.0])  # behind it
     robot = Unicycle()
-    loop, _ = drive(
+    _loop, _ = drive(
         robot,
         Observed(FREE, torch.zeros(1, 2), 0.3),
         replace(QUICK, planner=BasePlannerConfig(), time_limit=9.0),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import robots.simulation.camera as camera_module
 from robots.errors import RobotError, UnknownLinkError
 from robots.simulation import (
     Box,
@@ -19,6 +20,7 @@ from robots.simulation import (
     make_scene,
 )
 from robots.simulation.poses import planar_pose
+from robots.simulation.ray_casting import RayCaster
 from tests.robots.simulation.models import CART_JOINTS
 
 
@@ -72,6 +74,18 @@ def test_a_ball_appears_at_its_projection_and_occludes_what_is_behind(yard):
         assert camera.render().depth[60, 80] == pytest.approx(0.9, abs=1e-4)
         world.set_object_pose("post", planar_pose(1.2, 0, 1.0))
         assert camera.render().depth[60, 80] == pytest.approx(1.1, abs=1e-4)
+
+
+def test_what_moves_again_and_again_does_not_cost_the_scene_again(monkeypatch, yard):
+    built = []
+    monkeypatch.setattr(camera_module, "RayCaster", lambda mesh: built.append(mesh) or RayCaster(mesh))
+    with World(yard) as world:
+        world.add_body(Box("post", planar_pose(1.0, 0, 1.0), (0.2, 0.2, 0.4)))
+        camera = DepthCamera(world, T_link_camera=_looking([0.0, 0.0, 1.0]))
+        for x in (1.0, 1.2, 1.4, 1.6, 1.4):
+            world.set_object_pose("post", planar_pose(x, 0, 1.0))
+            assert camera.render().depth[60, 80] == pytest.approx(x - 0.1, abs=1e-4)
+        assert len(built) <= 3, "the scene, the scene without the post, and the post"
 
 
 @pytest.mark.parametrize("name", ["apartment", "office", "flat"])
