@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 # The base has made progress since a failure when it is this far from where it stood then [m].
 PROGRESS = 0.1
@@ -46,7 +47,7 @@ class ReplanningConfig:
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
         look_ahead: distance along the path [m] at which the camera looks.
-        look_near: the same for the floor while it turns on the spot.
+        look_near: distance [m] at which it looks at the floor, too, while it turns on the spot.
         look_heights: heights [m] there between which it nods: no view is wide enough to see both what stands on the
             floor and what hangs as high as the robot's head.
         nod: time [s] at each of them.
@@ -64,7 +65,7 @@ class ReplanningConfig:
     look_ahead: float = 1.5
     look_near: float = 0.7
     look_heights: tuple[float, ...] = (0.0, 1.1)
-    nod: float = 0.6
+    nod: float = 0.5
     extend: float = 0.5
     stuck: float = 2.0
     patience: int = 15
@@ -327,19 +328,18 @@ class ReplanningLoop:
             self._ahead(state)
             return
         target = path[nearest + int(np.searchsorted(along, self.config.look_ahead).clip(0, len(along) - 1))]
-        self.robot.look_at(np.array([*target, self._height()]))
+        self.robot.look_at(np.array([*target, self._nod(self.config.look_heights)]))
 
     def _ahead(self, state: ndarray) -> None:
-        """Look the way the base faces, and nearer where it looks down: to see where it could drive off."""
-        height = self._height()
-        distance = self.config.look_near if height <= 0 else self.config.look_ahead
+        """Look the way the base faces, and at the floor before it, too: to see where it could drive off."""
+        far = [(self.config.look_ahead, height) for height in self.config.look_heights]
+        distance, height = self._nod([(self.config.look_near, 0.0), *far])
         direction = np.array([math.cos(state[2]), math.sin(state[2])])
         self.robot.look_at(np.array([*(state[:2] + distance * direction), height]))
 
-    def _height(self) -> float:
-        """Where to look now between the heights that the camera nods between [m]."""
-        heights = self.config.look_heights
-        return heights[int(self.robot.time / self.config.nod) % len(heights)]
+    def _nod(self, between: Sequence[T]) -> T:
+        """One of the things to look at in turn."""
+        return between[int(self.robot.time / self.config.nod) % len(between)]
 
     def _end(self, status: DriveStatus, message: str) -> None:
         self.report.status, self.report.message = status, message
