@@ -46,7 +46,7 @@ def main(options: LiftObject) -> float:
         raise SystemExit(f"{options.scene} has no object to grasp; choose apartment, office or flat")
     episode = Episode(options, task.park)
     point = click_on(episode.world, task.object_name, np.array([*task.park[:2], 1.2]), options.seed)
-    close = close_look(episode, point, options.looks, options.clock())
+    close = close_look(episode, point, options.looks, episode.clock())
     options.out.mkdir(parents=True, exist_ok=True)
     around = torch.as_tensor(np.stack([point - 0.2, point + 0.2]), dtype=torch.float32)
     isdf.plot_slice(close, float(point[2]), bounds=around, spacing=0.004).savefig(options.out / "slice.png")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from dataclasses import field as option
 from pathlib import Path
 
 import numpy as np
 import torch
+import tyro
 
 import isdf
 import robots
 from examples.disturbances import Disturbance, DisturbedRobot
+from examples.live import Live, LiveOptions
 from examples.maps import Method, TrueMap, mean_error, new_map
 from isdf.mapping.field import LatticeField
 from planning.clock import Clock, FixedClock, MeasuredClock
@@ -39,10 +42,8 @@ class EpisodeOptions:
     """The map to drive by; `truth` knows the world beforehand."""
     fixed_cost: bool = False
     """Charge fixed times for computing instead of measured CPU time, so that runs repeat exactly."""
-
-    def clock(self) -> Clock:
-        """What computing costs the robot in time."""
-        return FixedClock() if self.fixed_cost else MeasuredClock()
+    live: tyro.conf.OmitArgPrefixes[LiveOptions] = option(default_factory=LiveOptions, kw_only=True)
+    """Watching."""
 
 
 class Episode:
@@ -73,10 +74,15 @@ class Episode:
         self.world = World(self.scene)
         noise = DepthNoise() if options.noise else None
         simulated = SimulatedMobileRobot(self.world, self.model, q, noise=noise, seed=options.seed)
-        self.robot = DisturbedRobot(simulated, disturbances)
         self.body = robots.SweptBase(self.model, torch.as_tensor(q, dtype=torch.float32))
         self.mapper = new_map(options.method, options.seed, self.world)
+        self.live = Live(options.live, self.model, self.world, self.mapper)
+        self.robot = DisturbedRobot(simulated, [*disturbances, self.live])
         self.monitor = CollisionMonitor(self.spheres)
+
+    def clock(self) -> Clock:
+        """What computing costs the robot in time; watching it costs nothing."""
+        return FixedClock() if self.options.fixed_cost else MeasuredClock(timer=self.live.timer)
 
     def spheres(self) -> Spheres:
         """The robot's spheres where they are now: centres (s, 3) and radii (s,) [m]."""
@@ -109,7 +115,8 @@ class Episode:
         return self.robot.recording.touched()
 
     def close(self) -> None:
-        """Shut the simulator down."""
+        """Shut the simulator down, once nobody watches any more."""
+        self.live.close()
         self.world.close()
 
 

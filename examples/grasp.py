@@ -75,7 +75,7 @@ class GraspEpisode:
         self.point = click_on(
             self.episode.world, self.task.object_name, np.array([*self.task.park[:2], 1.2]), options.seed
         )
-        self.clock = options.clock()
+        self.clock = self.episode.clock()
         self.drive: DriveReport | None = None
         self.reason = ""
         self.planning_seconds = 0.0

@@ -52,6 +52,7 @@ def main(options: Navigate) -> dict:
     with tqdm(desc="driving", unit=" rounds", disable=None) as bar:
 
         def watch(loop: ReplanningLoop) -> None:
+            episode.live.follow(loop, goal_moves=True)
             film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy())
             left = np.linalg.norm(episode.robot.base_state()[:2] - goal)
             bar.set_postfix_str(f"t = {episode.robot.time:.0f} s, {left:.1f} m to go")
@@ -63,7 +64,7 @@ def main(options: Navigate) -> dict:
             episode.mapper,
             episode.field_for_driving,
             ReplanningConfig(),
-            options.clock(),
+            episode.clock(),
             watch,
             options.seed,
             episode.monitor,
