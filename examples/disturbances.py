@@ -68,6 +68,11 @@ class DisturbedRobot:
             disturbance.advance(self._undisturbed, duration)
         self._undisturbed.drive(v, omega, duration)
 
+    def wait(self, duration: float, period: float = 0.1) -> None:
+        """Let time [s] pass at rest, while the world changes."""
+        for _ in range(max(1, round(duration / period))):
+            self.drive(0.0, 0.0, period)
+
 
 @dataclass
 class PoseNoise:

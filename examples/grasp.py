@@ -75,6 +75,7 @@ class GraspEpisode:
         self.point = click_on(
             self.episode.world, self.task.object_name, np.array([*self.task.park[:2], 1.2]), options.seed
         )
+        self.point = self.episode.live.moved_goal(self.point)
         self.clock = self.episode.clock()
         self.drive: DriveReport | None = None
         self.reason = ""
@@ -100,6 +101,8 @@ class GraspEpisode:
                 continue
             self.bar.set_description("grasping")
             self.film.close_up = self.point
+            self.episode.live.reach([chosen[1], chosen[0].approach, chosen[0].lift])
+            self.episode.live.say("grasping")
             name = self.task.object_name
             self.lift_height = take(self.episode, *chosen, name, self.film.add)
             self.reason = ""
@@ -132,7 +135,7 @@ class GraspEpisode:
             episode.field_for_driving,
             ReplanningConfig(scan=scan, time_limit=60.0),
             self.clock,
-            lambda loop: self.film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy()),
+            self.watch,
             self.options.seed,
             episode.monitor,
         )
@@ -140,10 +143,19 @@ class GraspEpisode:
         self.drive = report if self.drive is None else self.drive.joined(report)
         return report.success
 
+    def watch(self, loop: ReplanningLoop) -> None:
+        """Film and show a drive."""
+        self.film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy())
+        self.episode.live.follow(loop)
+
     def plan(self) -> tuple[Grasp, torch.Tensor] | str:
         """Look closely, then choose a grasp and the way to it; or say why there is none."""
-        options, robot = self.options, self.episode.robot
+        options, robot, live = self.options, self.episode.robot, self.episode.live
+        live.say("looking closely")
         close = close_look(self.episode, self.point, options.looks, self.clock, self.film.add)
+        self.point = live.moved_goal(self.point)  # somebody may have dragged it
+        live.look_closely(close, self.point)
+        live.say("choosing a grasp")
         found, spent = self.clock.charge(
             lambda: choose_grasp(self.episode, close, self.point, options.margin, options.seed)
         )

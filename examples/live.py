@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,11 @@ import numpy as np
 import torch
 
 import robots
+from examples.arm import parked
 from isdf.errors import NotReadyError
+from isdf.meshing import zero_level_mesh
 from isdf.viewer import Line, Recorder, Shape, Spheres, Viewer, ViewState
+from planning.protocols import DistanceField
 from planning.replanning import ReplanningLoop
 from robots.simulation import DepthFrame, SimulatedMobileRobot, World
 from robots.simulation.poses import link_frames
@@ -21,8 +24,11 @@ from robots.simulation.ray_casting import link_surfaces
 
 SHOWN_EVERY, RECORDED_EVERY, FIELD_EVERY = 0.1, 0.1, 0.5
 """Least times between two states: for the viewer [s of wall time], recorded [s of the robot's time], of the map [s]."""
-ABOVE_FLOOR = 0.03
+ABOVE_FLOOR = 0.08
 """Where ways of the base are drawn [m]."""
+CLOSE = 0.16
+"""Of the finer map round an object that much is drawn to all sides [m]."""
+CLOSE_COLOUR = (120, 190, 215)
 PLAN_COLOUR, WAY_COLOUR, TOOL_COLOUR = (40, 170, 60), (215, 50, 40), (150, 60, 190)
 
 
@@ -52,6 +58,7 @@ class Live:
         self.viewer = Viewer(options.viewer_port) if options.viewer else None
         self.recorder = Recorder(options.record) if options.record else None
         self._model, self._world, self._mapper = model, world, mapper
+        self._robot: SimulatedMobileRobot | None = None
         self._frame: DepthFrame | None = None
         self._field: tuple[Any, Any, float] = (None, None, -np.inf)  # field, of which map, made at
         self._goal: np.ndarray | None = None
@@ -82,6 +89,7 @@ class Live:
         """Show what is, and wait while somebody has paused."""
         if not self.active:
             return
+        self._robot = robot
         self._show(robot)
         if self.viewer is not None and self.viewer.hold():
             self._shown_at = -np.inf
@@ -106,8 +114,10 @@ class Live:
         return self._goal
 
     def say(self, status: str) -> None:
-        """What the robot is about, in a line."""
-        self._status = status
+        """What the robot is about, in a line; shown at once."""
+        self._status, self._shown_at = status, -np.inf
+        if self.active and self._robot is not None:
+            self._show(self._robot)
 
     def line(
         self, name: str, points: np.ndarray, colour: tuple[int, int, int] = PLAN_COLOUR, width: float = 0.03
@@ -116,16 +126,20 @@ class Live:
         if self.active:
             self._lines = self._lines | {name: Line(np.array(points, np.float32), colour, width)}
 
-    def tool_way(self, name: str, model: robots.Robot, q: torch.Tensor) -> None:
-        """Draw the way of the hand along postures q (n, dof) of a model."""
-        if self.active and model.tool_link is not None:
-            (poses,) = model.link_poses(q, [model.tool_link])
-            self.line(name, poses[:, :3, 3].numpy(), TOOL_COLOUR, 0.008)
-
-    def shape(self, name: str, make: Callable[[], Shape]) -> None:
-        """Draw a mesh in place of the last one of that name; it is made only if somebody sees it."""
+    def look_closely(self, close: DistanceField, point: np.ndarray) -> None:
+        """Draw the zero level of a finer map round a point [m]."""
         if self.active:
-            self._shapes = self._shapes | {name: make()}
+            around = torch.as_tensor(np.stack([point - CLOSE, point + CLOSE]), dtype=torch.float32)
+            mesh = zero_level_mesh(close, 0.006, around, padding=0.0)
+            self._shapes = self._shapes | {"close map": _shape(mesh, CLOSE_COLOUR)}
+
+    def reach(self, ways: Sequence[torch.Tensor]) -> None:
+        """Draw the way of the hand along planned postures (n, dof) of the arm, the base where it is."""
+        if self.active:
+            model, _ = parked(self._model, self._world.robot_state()[0])
+            assert model.tool_link is not None
+            poses = model.link_poses(torch.cat(list(ways)), [model.tool_link])[:, 0]
+            self.line("reach", poses[:, :3, 3].numpy(), TOOL_COLOUR, 0.01)
 
     def close(self) -> None:
         """End; with a browser connected not before it has left, or Ctrl-C."""
@@ -215,8 +229,6 @@ def _said(loop: ReplanningLoop) -> str:
         return f"standing, without a plan{': ' + loop.report.message if loop.report.message else ''}"
     way = loop.plan.trajectory.waypoints
     length = float((way[1:] - way[:-1]).norm(dim=1).sum())
-    ends = "to the goal" if loop.leads_to_goal else "nearer to the goal: the map shows no way to it yet"
-    return (
-        f"plan {loop.report.plans}: {length:.1f} m {ends}, {100 * loop.plan.clearance:.0f} cm clear, "
-        f"made in {loop.last_planning:.2f} s"
-    )
+    ends = "to the goal" if loop.leads_to_goal else "as near to the goal as the map shows a way"
+    clear = f", {100 * loop.plan.clearance:.0f} cm clear" if loop.plan.success else ""
+    return f"plan {loop.report.plans}: {length:.1f} m {ends}{clear}, made in {loop.last_planning:.2f} s"

@@ -12,13 +12,13 @@ from jaxtyping import Float, UInt8
 from ..slice_geometry import corners, slice_basis
 
 Quantity = Literal["distance", "confidence"]
-COLOUR_LIMIT = 1.0
+COLOUR_LIMIT = 0.8
 """Distance [m] at which colours end."""
 ELEMENTS, LEAST_SPACING = 260, 0.02
 """Picture elements along the longer side of a slice, and their least size [m]."""
 BEYOND = 0.2
 """What is shown round the mapped area [m]."""
-UNSURE = 0.25
+UNSURE = 0.35
 """Opacity where the map is not sure of anything."""
 
 
@@ -63,7 +63,7 @@ def slice_picture(
     sure = confidence_of(field, points)
     image = _distance_colours(distance, spacing) if quantity == "distance" else _share_colours(sure)
     opacity = UNSURE + (1 - UNSURE) * np.clip(sure, 0, 1) if fade else np.ones_like(sure)
-    image[..., 3] = np.round(235 * opacity)
+    image[..., 3] = np.round(200 * opacity)
     middle = np.array([(xs[0] + xs[-1]) / 2, (ys[0] + ys[-1]) / 2, height]) @ basis
     return Slice(image, middle, basis, (len(xs) * spacing, len(ys) * spacing))
 

@@ -41,6 +41,7 @@ class Stage:
         self._hidden: set[str] = set()
         self._dragging = False
         self.slice: Slice | None = None
+        """What was drawn last."""
 
     def draw(self, state: ViewState) -> None:
         """Show a state in place of the last one; slice and surface stay."""
@@ -61,7 +62,6 @@ class Stage:
 
     def draw_slice(self, shown: Slice) -> None:
         """Show a slice of the map in place of the last one."""
-        self.slice = shown
         right, back, normal = shown.axes
         # viser draws an image with its first row at -y, seen from -z.
         rotation = np.stack([right, -back, -normal], axis=1)
@@ -69,11 +69,13 @@ class Stage:
         if picture is not None and shown.size == (picture.render_width, picture.render_height):
             picture.image = shown.image
             picture.position = shown.centre
+            self.slice = shown
             return
         self._handles["slice"] = self._scene.add_image(
             "/slice", shown.image, *shown.size, format="png", position=shown.centre, cast_shadow=False,
             receive_shadow=False, wxyz=self._so3.from_matrix(rotation).wxyz, visible="slice" not in self._hidden,
         )  # fmt: skip
+        self.slice = shown
 
     def set_visible(self, layer: str, visible: bool) -> None:
         """Show or hide a layer."""
@@ -83,29 +85,24 @@ class Stage:
                 handle.visible = visible
 
     def _put(self, name: str, thing: Shape | Spheres | Line) -> None:
-        if self._moved(self._handles.get(name), self._drawn.get(name), thing):
+        if self._unchanged(self._handles.get(name), self._drawn.get(name), thing):
             self._drawn[name] = thing
             return
-        self._remove(name)
-        self._drawn[name] = thing
+        # A thing added under the name of another takes its place without a flicker.
         handle = self._added(f"/{name}", thing)
-        if handle is not None:
+        if handle is None:
+            self._remove(name)
+        else:
             handle.visible = _layer(name) not in self._hidden
             self._handles[name] = handle
+        self._drawn[name] = thing
 
-    def _moved(self, handle: Any, old: Any, new: Shape | Spheres | Line) -> bool:
-        """Whether what is drawn could be changed into the new thing, which does not flicker."""
+    def _unchanged(self, handle: Any, old: Any, new: Shape | Spheres | Line) -> bool:
+        """Whether what is drawn is like the new thing, or could be moved to be."""
         if handle is None:
             return False
-        if (
-            isinstance(old, Line)
-            and isinstance(new, Line)
-            and old.colour == new.colour
-            and len(new.points) > 1
-        ):
-            if not np.array_equal(old.points, new.points):
-                handle.points = _segments(new)
-            return True
+        if isinstance(old, Line) and isinstance(new, Line):
+            return old.colour == new.colour and np.array_equal(old.points, new.points)
         if isinstance(old, Spheres) and isinstance(new, Spheres) and len(old.radii) == len(new.radii):
             handle.batched_positions, handle.batched_scales = new.centres, new.radii
             return True
@@ -177,11 +174,10 @@ class Stage:
             handle = self._scene.add_frame("/goal", show_axes=False, position=at)
         else:
             handle = self._scene.add_transform_controls(
-                "/goal", scale=0.2 if in_space else 0.7, line_width=4.0, active_axes=(True, True, in_space),
-                disable_rotations=True, depth_test=False, position=at,
+                "/goal", scale=0.2 if in_space else 0.7, line_width=2.5 if in_space else 4.0, position=at,
+                active_axes=(True, True, in_space), disable_rotations=True, depth_test=False,
             )  # fmt: skip
-            handle.on_drag_start(lambda _: self._drag(True, len(goal)))
-            handle.on_drag_end(lambda _: self._drag(False, len(goal)))
+            handle.on_update(lambda event: self._drag(event.phase != "end", len(goal)))
         post = 0.0 if in_space else GOAL_POST
         size = 0.012 if in_space else 0.09
         self._scene.add_icosphere("/goal/ball", size, GOAL_COLOUR, position=(0, 0, post), cast_shadow=False)
@@ -190,9 +186,9 @@ class Stage:
             self._scene.add_line_segments("/goal/post", line, GOAL_COLOUR, thickness=0.03)
         self._handles["goal"] = handle
 
-    def _drag(self, begins: bool, size: int) -> None:
-        self._dragging = begins
-        if not begins and self._on_goal is not None:
+    def _drag(self, goes_on: bool, size: int) -> None:
+        self._dragging = goes_on
+        if not goes_on and self._on_goal is not None:
             self._drawn["goal"] = at = np.array(self._handles["goal"].position)
             self._on_goal(at[:size])
 

@@ -60,7 +60,8 @@ class Viewer:
         self._up = np.asarray(up, dtype=float) / np.linalg.norm(up)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server = _viser().ViserServer(host, port, label="isdf", verbose=False)
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_layout="fixed")
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
         self.stage = Stage(self.server, self._up, self.controls.move_goal if goal_moves else None)
         self.panel = Panel(self.server, self.controls, self.stage.set_visible, goal_moves)
         self.url = f"http://localhost:{self.server.get_port()}"
@@ -143,7 +144,9 @@ class Viewer:
         started = time.monotonic()
         compose = self._mailbox.take(DRAW_PERIOD)
         if compose is not None:
-            self._draw(compose())
+            state = compose()
+            with self.server.atomic():  # so that a browser shows all of it at once
+                self._draw(state)
         if self.panel.changed:
             self._draw_slice()
         if self._field is not self._meshed and time.monotonic() >= self._mesh_at:
