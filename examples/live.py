@@ -59,7 +59,8 @@ class Live:
         self.recorder = Recorder(options.record) if options.record else None
         self._model, self._world, self._mapper = model, world, mapper
         self._robot: SimulatedMobileRobot | None = None
-        self._frame: DepthFrame | None = None
+        self.last_frame: DepthFrame | None = None
+        """What the robot has seen last."""
         self._field: tuple[Any, Any, float] = (None, None, -np.inf)  # field, of which map, made at
         self._goal: np.ndarray | None = None
         self._lines: dict[str, Line] = {}
@@ -82,7 +83,7 @@ class Live:
 
     def frame(self, frame: DepthFrame | None) -> DepthFrame | None:
         """The image as it is."""
-        self._frame = self._frame if frame is None else frame
+        self.last_frame = self.last_frame if frame is None else frame
         return frame
 
     def advance(self, robot: SimulatedMobileRobot, duration: float) -> None:
@@ -176,7 +177,7 @@ class Live:
         shapes, poses = self._bodies(robot)
         posture = torch.as_tensor(robot.posture(), dtype=torch.float32)
         way, model = list(self._way), self._model
-        given = (robot.time, self._status, self._frame, self._snapshot(), shapes, poses)
+        given = (robot.time, self._status, self.last_frame, self._snapshot(), shapes, poses)
         lines, goal = self._lines, self._goal
 
         def compose() -> ViewState:
