@@ -37,7 +37,7 @@ class DisturbedRobot:
     """
 
     def __init__(self, robot: SimulatedMobileRobot, disturbances: Sequence[Disturbance]) -> None:
-        self._undisturbed, self.disturbances = robot, disturbances
+        self._undisturbed, self.disturbances = robot, list(disturbances)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._undisturbed, name)

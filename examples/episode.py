@@ -127,6 +127,13 @@ def chosen_scene(options: EpisodeOptions) -> Scene:
     return make_scene(options.scene, options.seed)
 
 
+def outline_at(model: robots.Robot, q: np.ndarray, height: float) -> np.ndarray:
+    """Centres and radii (n, 3) of the discs in which a level plane cuts the robot's spheres [m]."""
+    centres, radii = model.spheres(torch.as_tensor(q, dtype=torch.float32))
+    cut = (radii**2 - (centres[:, 2] - height) ** 2).clamp(min=0.0).sqrt()
+    return np.column_stack([centres[:, :2].numpy(), cut.numpy()])[cut.numpy() > 0]
+
+
 def base_outline(model: robots.Robot, q: np.ndarray) -> np.ndarray:
     """Centres and radii (s, 3) of the robot's spheres seen from above, to draw it [m]."""
     centres, radii = model.spheres(torch.as_tensor(q, dtype=torch.float32))

@@ -105,6 +105,9 @@ class GraspEpisode:
                 continue
             self.bar.set_description("grasping")
             self.chosen = chosen[0]
+            self.film.tool_way = self.tool_way()
+            self.film.close_map = None if self.looked is None else self.looked[0]
+            self.episode.robot.disturbances.append(self.film)
             self.film.close_up = self.point
             self.episode.live.reach([chosen[1], chosen[0].approach, chosen[0].lift])
             self.episode.live.say("grasping")

@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from examples.episode import Episode
-from examples.pictures import draw_map
-from isdf.slices import draw_slice
+from examples.pictures import draw_grasp, draw_map
 from isdf.viewer.pictures import depth_picture
 from planning.protocols import DistanceField
 from robots.simulation import DepthFrame
@@ -21,10 +20,6 @@ MOMENTS = 150
 """At most so many postures of an episode are looked at."""
 LEAST = 0.05
 """Clearance under which a way is called close [m]."""
-NEAR = 0.08
-"""Distance at which the colours of the finer map end [m]."""
-ROUND_OBJECT = 0.15
-"""Of the map round an object that much is drawn to all sides [m]."""
 
 
 def drive_summary(
@@ -106,22 +101,6 @@ def draw_click(axes: Axes, frame: DepthFrame, point: np.ndarray) -> None:
     )
     axes.set_title("depth image with the clicked point")
     axes.set_axis_off()
-
-
-def draw_grasp(axes: Axes, close: DistanceField, point: np.ndarray, tool_way: np.ndarray | None) -> None:
-    """The finer map at the height of the point, and the way of the hand to it, from above."""
-    around = torch.as_tensor(np.stack([point - ROUND_OBJECT, point + ROUND_OBJECT]), dtype=torch.float32)
-    image = draw_slice(axes, close, float(point[2]), np.array([0.0, 0.0, 1.0]), spacing=0.003, bounds=around)
-    image.set_clim(-NEAR, NEAR)
-    axes.plot(*point[:2], "+", color="black", markersize=12)
-    if tool_way is not None:
-        axes.plot(tool_way[:, 0], tool_way[:, 1], color="purple", linewidth=2.0)
-        axes.plot(*tool_way[-1, :2], "o", color="purple")
-    axes.set_xlim(point[0] - ROUND_OBJECT, point[0] + ROUND_OBJECT)
-    axes.set_ylim(point[1] - ROUND_OBJECT, point[1] + ROUND_OBJECT)
-    axes.set_title(
-        f"finer map at {point[2]:.2f} m, {'hand (purple)' if tool_way is not None else 'no grasp'}"
-    )
 
 
 def draw_lift(axes: Axes, episode: Episode, name: str) -> None:
