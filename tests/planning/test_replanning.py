@@ -296,7 +296,7 @@ def test_a_goal_that_is_changed_on_the_way_is_driven_to_instead() -> None:
             loop.change_goal(there)
             assert loop.plan is None and not loop.leads_to_goal
 
-    loop, report = drive(robot, PILLAR, watch=watch)
+    _, report = drive(robot, PILLAR, watch=watch)
     assert report.success and np.linalg.norm(robot.state[:2] - there) < 0.05
     assert report.goal_distance < 0.05 and places(robot)[:, 0].max() < GOAL[0] - 1.0
     assert any("the goal is now 1.20, -1.40" in event for event in report.events)
