@@ -231,5 +231,4 @@ def _said(loop: ReplanningLoop) -> str:
     way = loop.plan.trajectory.waypoints
     length = float((way[1:] - way[:-1]).norm(dim=1).sum())
     ends = "to the goal" if loop.leads_to_goal else "as near to the goal as the map shows a way"
-    clear = f", {100 * loop.plan.clearance:.0f} cm clear" if loop.plan.success else ""
-    return f"plan {loop.report.plans}: {length:.1f} m {ends}{clear}, made in {loop.last_planning:.2f} s"
+    return f"plan {loop.report.plans}: {length:.1f} m {ends}, made in {loop.last_planning:.2f} s"
