@@ -25,12 +25,13 @@ def page_of(url: str) -> Iterator[tuple[Any, list[str]]]:
     if found is None:
         pytest.skip(f"no browser: none of {', '.join(NAMES)} is installed (apt-get install chromium)")
     with sync_api.sync_playwright() as playwright:
+        # A machine that has much else to do is slow to draw in software.
         browser = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
         page, errors = browser.new_page(viewport=SIZE), []
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda said: _note(said, errors))
         page.goto(url)
-        page.wait_for_selector("canvas", timeout=20_000)
+        page.wait_for_selector("canvas", timeout=60_000)
         yield page, errors
         browser.close()
 
@@ -40,7 +41,7 @@ def _note(said: Any, errors: list[str]) -> None:
         errors.append(said.text)
 
 
-def wait(page: Any, true: Any, seconds: float = 25.0) -> None:
+def wait(page: Any, true: Any, seconds: float = 60.0) -> None:
     """Let the page go on until something is true."""
     for _ in range(round(seconds / 0.1)):
         if true():

@@ -53,7 +53,7 @@ def watched(monkeypatch):
     monkeypatch.setattr(Viewer, "watched", property(lambda self: not self._closing.is_set()))
 
 
-def until(true, seconds: float = 10.0) -> None:
+def until(true, seconds: float = 30.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "it did not happen in time"
@@ -229,7 +229,7 @@ def test_a_new_recording_replaces_the_old_one_and_one_that_is_too_fast_leaves_st
     began = time.monotonic()
     for _ in range(10):
         second.add(slow)
-    assert time.monotonic() - began < 0.5, "who records does not wait"
+    assert time.monotonic() - began < 2.0, "who records does not wait"
     release.set()
     second.close()
     assert set(Recording(tmp_path).times) == {6.0} and second.left_out >= 7
@@ -249,7 +249,7 @@ def test_a_loop_does_not_wait_for_a_viewer_that_hangs(viewer, watched, monkeypat
     for t in range(1, 1001):
         viewer.show(lambda t=t: ViewState(float(t)))
         assert viewer.controls.may_go() and viewer.controls.take_goal() is None
-    assert time.monotonic() - began < 0.5
+    assert time.monotonic() - began < 2.0
     hangs.set()
     until(lambda: len(drawn) == 2)
     assert drawn == [0.0, 1000.0], "only the newest was drawn"
