@@ -157,7 +157,7 @@ def episode(task: NavigationTask) -> dict:
 
     config = ReplanningConfig(time_limit=60.0 + 10.0 * task.shortest)
     loop = ReplanningLoop(
-        ride.robot, ride.body, ride.mapper, ride.field_for_driving, config, options.clock(), watch, task.number,
+        ride.robot, ride.body, ride.mapper, ride.field_for_driving, config, ride.clock(), watch, task.number,
         ride.monitor,
     )  # fmt: skip
     drive = loop.drive_to(np.array(task.goal))

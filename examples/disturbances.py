@@ -37,7 +37,7 @@ class DisturbedRobot:
     """
 
     def __init__(self, robot: SimulatedMobileRobot, disturbances: Sequence[Disturbance]) -> None:
-        self._undisturbed, self.disturbances = robot, disturbances
+        self._undisturbed, self.disturbances = robot, list(disturbances)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._undisturbed, name)
@@ -67,6 +67,11 @@ class DisturbedRobot:
         for disturbance in self.disturbances:
             disturbance.advance(self._undisturbed, duration)
         self._undisturbed.drive(v, omega, duration)
+
+    def wait(self, duration: float, period: float = 0.1) -> None:
+        """Let time [s] pass at rest, while the world changes."""
+        for _ in range(max(1, round(duration / period))):
+            self.drive(0.0, 0.0, period)
 
 
 @dataclass

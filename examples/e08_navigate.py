@@ -42,8 +42,9 @@ def main(options: Drive) -> DriveReport:
     goal = np.array(episode.scene.goal[:2])
     with tqdm(desc="driving", unit=" rounds", disable=None) as bar:
 
-        def watch(_: ReplanningLoop) -> None:
-            left = np.linalg.norm(episode.robot.base_state()[:2] - goal)
+        def watch(loop: ReplanningLoop) -> None:
+            episode.live.follow(loop, goal_moves=True)  # with --viewer: drag the goal
+            left = np.linalg.norm(episode.robot.base_state()[:2] - loop.goal)
             bar.set_postfix_str(f"t = {episode.robot.time:.0f} s, {left:.1f} m to go")
             bar.update()
 
@@ -53,7 +54,7 @@ def main(options: Drive) -> DriveReport:
             episode.mapper,  # learns from the frames
             episode.field_for_driving,  # what is planned in
             ReplanningConfig(time_limit=options.time_limit),
-            options.clock(),  # what computing costs the robot in time
+            episode.clock(),  # what computing costs the robot in time
             watch,
             monitor=episode.monitor,  # has the last word on every command
         )
@@ -69,7 +70,7 @@ def main(options: Drive) -> DriveReport:
     driven = episode.robot.recording.base_poses()
     axes = figure.axes[0]
     axes.plot(driven[:, 0], driven[:, 1], color="red")
-    axes.plot(*goal, "*", color="gold", markersize=14, markeredgecolor="black")
+    axes.plot(*loop.goal, "*", color="gold", markersize=14, markeredgecolor="black")
     figure.savefig(options.out / "way.png")
     episode.close()
     return report

@@ -46,15 +46,22 @@ def main(options: LiftObject) -> float:
         raise SystemExit(f"{options.scene} has no object to grasp; choose apartment, office or flat")
     episode = Episode(options, task.park)
     point = click_on(episode.world, task.object_name, np.array([*task.park[:2], 1.2]), options.seed)
-    close = close_look(episode, point, options.looks, options.clock())
+    point = episode.live.moved_goal(point)  # with --viewer it can be dragged
+    episode.live.say("looking closely")
+    close = close_look(episode, point, options.looks, episode.clock())
     options.out.mkdir(parents=True, exist_ok=True)
     around = torch.as_tensor(np.stack([point - 0.2, point + 0.2]), dtype=torch.float32)
     isdf.plot_slice(close, float(point[2]), bounds=around, spacing=0.004).savefig(options.out / "slice.png")
 
+    point = episode.live.moved_goal(point)
+    episode.live.look_closely(close, point)
+    episode.live.say("choosing a grasp")
     chosen = choose_grasp(episode, close, point, options.margin, options.seed)
     if isinstance(chosen, str):
         print(chosen)
         return 0.0
+    episode.live.reach([chosen[1], chosen[0].approach, chosen[0].lift])
+    episode.live.say("grasping")
     lifted = take(episode, *chosen, task.object_name)
     touched = episode.robot.recording.touched(ignore=(task.object_name,))
     print(f"lifted {100 * lifted:.0f} cm; contacts with anything else: {touched or 'none'}")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from dataclasses import field as option
 from pathlib import Path
 
 import numpy as np
 import torch
+import tyro
 
 import isdf
 import robots
 from examples.disturbances import Disturbance, DisturbedRobot
+from examples.live import Live, LiveOptions
 from examples.maps import Method, TrueMap, mean_error, new_map
 from isdf.mapping.field import LatticeField
 from planning.clock import Clock, FixedClock, MeasuredClock
@@ -50,10 +53,8 @@ class EpisodeOptions:
     """The map to drive by; `truth` knows the world beforehand."""
     fixed_cost: bool = False
     """Charge fixed times for computing instead of measured CPU time, so that runs repeat exactly."""
-
-    def clock(self) -> Clock:
-        """What computing costs the robot in time."""
-        return FixedClock() if self.fixed_cost else MeasuredClock()
+    live: tyro.conf.OmitArgPrefixes[LiveOptions] = option(default_factory=LiveOptions, kw_only=True)
+    """Watching."""
 
 
 class Episode:
@@ -86,10 +87,15 @@ class Episode:
         simulated = SimulatedMobileRobot(
             self.world, self.model, q, noise=noise, seed=options.seed, max_range=CAMERA_RANGE
         )
-        self.robot = DisturbedRobot(simulated, disturbances)
         self.body = robots.SweptBase(self.model, torch.as_tensor(q, dtype=torch.float32))
         self.mapper = new_map(options.method, options.seed, self.world)
+        self.live = Live(options.live, self.model, self.world, self.mapper)
+        self.robot = DisturbedRobot(simulated, [*disturbances, self.live])
         self.monitor = CollisionMonitor(self.spheres)
+
+    def clock(self) -> Clock:
+        """What computing costs the robot in time; watching it costs nothing."""
+        return FixedClock() if self.options.fixed_cost else MeasuredClock(timer=self.live.timer)
 
     def spheres(self) -> Spheres:
         """The robot's spheres where they are now: centres (s, 3) and radii (s,) [m]."""
@@ -122,7 +128,8 @@ class Episode:
         return self.robot.recording.touched()
 
     def close(self) -> None:
-        """Shut the simulator down."""
+        """Shut the simulator down, once nobody watches any more."""
+        self.live.close()
         self.world.close()
 
 
@@ -131,6 +138,13 @@ def chosen_scene(options: EpisodeOptions) -> Scene:
     if options.scene.endswith(".urdf"):
         return load_urdf_scene(options.scene)
     return make_scene(options.scene, options.seed)
+
+
+def outline_at(model: robots.Robot, q: np.ndarray, height: float) -> np.ndarray:
+    """Centres and radii (n, 3) of the discs in which a level plane cuts the robot's spheres [m]."""
+    centres, radii = model.spheres(torch.as_tensor(q, dtype=torch.float32))
+    cut = (radii**2 - (centres[:, 2] - height) ** 2).clamp(min=0.0).sqrt()
+    return np.column_stack([centres[:, :2].numpy(), cut.numpy()])[cut.numpy() > 0]
 
 
 def base_outline(model: robots.Robot, q: np.ndarray) -> np.ndarray:

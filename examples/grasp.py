@@ -3,8 +3,8 @@
     python -m examples.grasp --out runs/grasp --scene apartment --seed 0
 
 Given is a point on the object, as a click in the camera's image gives it; neither its shape and pose nor the room is.
-Leaves report.html, report.json, states.npz (every executed step), map.png, map.safetensors and episode.gif. Success is
-read from the physics: lifted 10 cm, held for 2 s.
+Leaves report.html, report.json, summary.png, states.npz (every executed step), map.png, map.safetensors and
+episode.gif. Success is read from the physics: lifted 10 cm, held for 2 s.
 """
 
 from __future__ import annotations
@@ -26,16 +26,18 @@ from tqdm import tqdm
 if not __package__:  # run as a file
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from examples.arm import Grasp
+from examples.arm import Grasp, parked
 from examples.episode import Episode, EpisodeOptions, chosen_scene
 from examples.grasp_stages import HELD_FOR, LIFTED, choose_grasp, close_look, take
 from examples.parking import parking_places
 from examples.pictures import Film, save_map_picture
 from examples.pointing import click_on
 from examples.report import write_report
+from examples.summary import grasp_summary
 from planning.drive import DriveReport
+from planning.protocols import DistanceField
 from planning.replanning import ReplanningConfig, ReplanningLoop
-from robots.simulation import GraspTask, Scene, SceneField
+from robots.simulation import DepthFrame, GraspTask, Scene, SceneField
 
 PLACES = 3
 """The robot tries at most so many places to park."""
@@ -75,8 +77,11 @@ class GraspEpisode:
         self.point = click_on(
             self.episode.world, self.task.object_name, np.array([*self.task.park[:2], 1.2]), options.seed
         )
-        self.clock = options.clock()
+        self.point = self.episode.live.moved_goal(self.point)
+        self.clock = self.episode.clock()
         self.drive: DriveReport | None = None
+        self.looked: tuple[DistanceField, DepthFrame] | None = None
+        self.chosen: Grasp | None = None
         self.reason = ""
         self.planning_seconds = 0.0
         self.lift_height = 0.0
@@ -99,7 +104,13 @@ class GraspEpisode:
                 ended, self.reason = "planning", chosen
                 continue
             self.bar.set_description("grasping")
+            self.chosen = chosen[0]
+            self.film.tool_way = self.tool_way()
+            self.film.close_map = None if self.looked is None else self.looked[0]
+            self.episode.robot.disturbances.append(self.film)
             self.film.close_up = self.point
+            self.episode.live.reach([chosen[1], chosen[0].approach, chosen[0].lift])
+            self.episode.live.say("grasping")
             name = self.task.object_name
             self.lift_height = take(self.episode, *chosen, name, self.film.add)
             self.reason = ""
@@ -132,7 +143,7 @@ class GraspEpisode:
             episode.field_for_driving,
             ReplanningConfig(scan=scan, time_limit=60.0),
             self.clock,
-            lambda loop: self.film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy()),
+            self.watch,
             self.options.seed,
             episode.monitor,
         )
@@ -140,16 +151,35 @@ class GraspEpisode:
         self.drive = report if self.drive is None else self.drive.joined(report)
         return report.success
 
+    def watch(self, loop: ReplanningLoop) -> None:
+        """Film and show a drive."""
+        self.film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy())
+        self.episode.live.follow(loop)
+
     def plan(self) -> tuple[Grasp, torch.Tensor] | str:
         """Look closely, then choose a grasp and the way to it; or say why there is none."""
-        options, robot = self.options, self.episode.robot
+        options, robot, live = self.options, self.episode.robot, self.episode.live
+        live.say("looking closely")
         close = close_look(self.episode, self.point, options.looks, self.clock, self.film.add)
+        if live.last_frame is not None:
+            self.looked = close, live.last_frame
+        self.point = live.moved_goal(self.point)  # somebody may have dragged it
+        live.look_closely(close, self.point)
+        live.say("choosing a grasp")
         found, spent = self.clock.charge(
             lambda: choose_grasp(self.episode, close, self.point, options.margin, options.seed)
         )
         self.planning_seconds += spent
         robot.wait(spent)
         return found
+
+    def tool_way(self) -> np.ndarray | None:
+        """Where the hand was to go on its last straight line (n, 3) [m]."""
+        if self.chosen is None:
+            return None
+        model, _ = parked(self.episode.model, self.episode.robot.posture())
+        assert model.tool_link is not None
+        return model.link_poses(self.chosen.approach, [model.tool_link])[:, 0, :3, 3].numpy()
 
 
 def start_before(scene: Scene, task: GraspTask, distance: float, seed: int) -> tuple[float, float, float]:
@@ -203,6 +233,9 @@ def main(options: GraspOptions) -> dict:
     episode.robot.recording.save(options.out / "states.npz")
     episode.save_map(options.out / "map.safetensors")
     save_map_picture(options.out / "map.png", episode, grasping.point)
+    line = f"{options.scene}, seed {options.seed}: {headline(report)}"
+    name, way = grasping.task.object_name, grasping.tool_way()
+    grasp_summary(options.out / "summary.png", episode, grasping.point, name, grasping.looked, way, line)
     if options.film:
         grasping.film.save(options.out / "episode.gif")
     write_report(options.out, report, headline(report))

@@ -2,8 +2,8 @@
 
     python -m examples.navigate --out runs/navigate --scene apartment --seed 0
 
-Leaves report.html, report.json, states.npz (every executed step), map.png, mesh.ply, map.safetensors and episode.gif.
-Success and contacts are read from the physics.
+Leaves report.html, report.json, summary.png, states.npz (every executed step), map.png, mesh.ply, map.safetensors and
+episode.gif. Success and contacts are read from the physics.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ if not __package__:  # run as a file
 from examples.episode import Episode, EpisodeOptions
 from examples.pictures import Film, save_map_picture
 from examples.report import write_report
+from examples.summary import drive_summary
 from isdf.meshing import zero_level_mesh
 from planning.drive import DriveReport
 from planning.replanning import ReplanningConfig, ReplanningLoop
@@ -52,6 +53,7 @@ def main(options: Navigate) -> dict:
     with tqdm(desc="driving", unit=" rounds", disable=None) as bar:
 
         def watch(loop: ReplanningLoop) -> None:
+            episode.live.follow(loop, goal_moves=True)
             film.add(None if loop.plan is None else loop.plan.trajectory.waypoints.numpy())
             left = np.linalg.norm(episode.robot.base_state()[:2] - goal)
             bar.set_postfix_str(f"t = {episode.robot.time:.0f} s, {left:.1f} m to go")
@@ -63,14 +65,15 @@ def main(options: Navigate) -> dict:
             episode.mapper,
             episode.field_for_driving,
             ReplanningConfig(),
-            options.clock(),
+            episode.clock(),
             watch,
             options.seed,
             episode.monitor,
         )
         drive = loop.drive_to(goal)
+    goal = loop.goal  # in the viewer it can be dragged
     report = _report(options, episode, goal, drive, time.perf_counter() - started)
-    _write(options, episode, film, goal, report)
+    _write(options, episode, film, loop, report)
     episode.close()
     return report
 
@@ -95,13 +98,17 @@ def _report(
     }
 
 
-def _write(options: Navigate, episode: Episode, film: Film, goal: np.ndarray, report: dict) -> None:
-    out = options.out
+def _write(options: Navigate, episode: Episode, film: Film, loop: ReplanningLoop, report: dict) -> None:
+    out, goal = options.out, loop.goal
     out.mkdir(parents=True, exist_ok=True)
     episode.robot.recording.save(out / "states.npz")
     episode.save_map(out / "map.safetensors")
     zero_level_mesh(episode.mapper.field(), 0.05).export(out / "mesh.ply")
     save_map_picture(out / "map.png", episode, goal)
+    plan = None if loop.plan is None else loop.plan.trajectory.waypoints.numpy()
+    drive_summary(
+        out / "summary.png", episode, goal, plan, f"{options.scene}, seed {options.seed}: {headline(report)}"
+    )
     if options.film:
         film.save(out / "episode.gif")
     write_report(out, report, headline(report))

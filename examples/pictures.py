@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pybullet
@@ -11,11 +13,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from examples.episode import Episode, base_outline
+from examples.episode import Episode, base_outline, outline_at
+from isdf.slices import draw_slice
+from planning.protocols import DistanceField
 from robots.simulation import World
 
 SLICE_HEIGHT = 0.5
 COLOUR_LIMIT = 1.0
+NEAR = 0.08
+"""Distance at which the colours of the finer map end [m]."""
+ROUND_OBJECT = 0.15
+"""Of the map round an object that much is drawn to all sides [m]."""
 
 
 class Film:
@@ -31,6 +39,10 @@ class Film:
         self.episode, self.goal, self.least_gap = episode, goal, least_gap
         self.close_up: np.ndarray | None = None
         """A point [m] to look at from near instead of the whole room."""
+        self.close_map: DistanceField | None = None
+        """A finer map round that point, drawn in place of the whole map."""
+        self.tool_way: np.ndarray | None = None
+        """Where the hand is to go (n, 3) [m]."""
         self._frames: list[Image.Image] = []
         self._last = -np.inf
 
@@ -42,15 +54,28 @@ class Film:
         self._last = robot.time
         figure = Figure(figsize=(9.6, 3.9), layout="constrained")
         left, right = figure.subplots(1, 2)
-        draw_map(left, self.episode, plan, self.goal, spacing=0.08)
-        left.set_title(f"map at {SLICE_HEIGHT} m, t = {robot.time:.0f} s")
+        if self.close_up is not None and self.close_map is not None:
+            cut = outline_at(self.episode.model, robot.posture(), float(self.close_up[2]))
+            draw_grasp(left, self.close_map, self.close_up, self.tool_way, cut)
+            left.set_title(f"finer map at {self.close_up[2]:.2f} m, t = {robot.time:.0f} s")
+        else:
+            draw_map(left, self.episode, plan, self.goal, spacing=0.08)
+            left.set_title(f"map at {SLICE_HEIGHT} m, t = {robot.time:.0f} s")
         right.imshow(photo(self.episode, close_up=self.close_up))
         right.set_axis_off()
         self._frames.append(_rendered(figure))
 
+    def frame(self, frame: Any) -> Any:
+        """The robot's image as it is: a film may sit beside the robot as a disturbance that changes nothing."""
+        return frame
+
+    def advance(self, robot: Any, duration: float) -> None:
+        """Film what the robot does between its stages, too."""
+        self.add()
+
     def save(self, path: Path) -> None:
         """Write the GIF, at most 60 frames of it."""
-        frames = self._frames[:: max(1, len(self._frames) // 60)]
+        frames = self._frames[:: -(-len(self._frames) // 60) or 1]
         if frames:
             small = [f.quantize(192, Image.Quantize.MAXCOVERAGE) for f in frames]
             small[0].save(path, save_all=True, append_images=small[1:], duration=180, loop=0, optimize=True)
@@ -95,6 +120,30 @@ def draw_map(axes, episode: Episode, plan, goal, spacing: float = 0.03, truth: b
     axes.plot(*goal[:2], "*", color="gold", markersize=14, markeredgecolor="black")
     axes.set_aspect("equal")
     return image
+
+
+def draw_grasp(
+    axes,
+    close: DistanceField,
+    point: np.ndarray,
+    tool_way: np.ndarray | None,
+    hand: Sequence[np.ndarray] = (),
+) -> None:
+    """The finer map at the height of the point from above, the way of the hand to it, and discs (n, 3) of the robot."""
+    around = torch.as_tensor(np.stack([point - ROUND_OBJECT, point + ROUND_OBJECT]), dtype=torch.float32)
+    image = draw_slice(axes, close, float(point[2]), np.array([0.0, 0.0, 1.0]), spacing=0.003, bounds=around)
+    image.set_clim(-NEAR, NEAR)
+    axes.plot(*point[:2], "+", color="black", markersize=12)
+    if tool_way is not None:
+        axes.plot(tool_way[:, 0], tool_way[:, 1], color="purple", linewidth=2.0)
+        axes.plot(*tool_way[-1, :2], "o", color="purple")
+    for x, y, radius in hand:
+        axes.add_patch(_disc(x, y, radius))
+    axes.set_xlim(point[0] - ROUND_OBJECT, point[0] + ROUND_OBJECT)
+    axes.set_ylim(point[1] - ROUND_OBJECT, point[1] + ROUND_OBJECT)
+    axes.set_title(
+        f"finer map at {point[2]:.2f} m, {'hand (purple)' if tool_way is not None else 'no grasp'}"
+    )
 
 
 def region(episode: Episode) -> np.ndarray:

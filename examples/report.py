@@ -28,7 +28,11 @@ def write_report(out: Path, report: dict[str, Any], headline: str) -> None:
     )
     pictures = "".join(
         f'<h2>{title}</h2><img src="{name}" alt="{title}">'
-        for name, title in (("episode.gif", "The episode"), ("map.png", "The map and the way"))
+        for name, title in (
+            ("summary.png", "In one picture"),
+            ("episode.gif", "The episode"),
+            ("map.png", "The map and the way"),
+        )
         if (out / name).exists()
     )
     verdict = "good" if report["success"] else "bad"

@@ -68,14 +68,19 @@ class Checkpointer:
         Raises:
             Stopped: a signal came.
         """
+        # What the other watcher takes, or waits for, is no time of the run's.
+        self._gap = max(time.monotonic() - self._called_at, FADING * self._gap)
         self._watch(mapper, arrived)
-        now = time.monotonic()
-        self._gap = max(now - self._called_at, FADING * self._gap)
-        self._called_at = now
+        self._called_at = now = time.monotonic()
         if self._signal is not None:
             raise Stopped(self._signal, self.save(mapper, finished=False))
         if mapper.frames_seen and now - self._saved_at + CAUTION * (self._gap + self._cost) >= self.every:
             self.save(mapper, finished=False)
+
+    @property
+    def stopping(self) -> bool:
+        """Whether a signal has asked the run to stop."""
+        return self._signal is not None
 
     def save(self, mapper: OnlineMapper, finished: bool) -> bool:
         """Save now; False where nothing was seen yet.

@@ -11,9 +11,10 @@ import logging
 import os
 import re
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
 import torch
@@ -29,8 +30,12 @@ from .isdf_mapper import IsdfConfig
 from .mapping import MapperConfig
 from .methods import Config, OnlineMapper, VoxelConfig
 from .results import write_results
-from .runner import Begun, RunReport, Watch, run_at_rate, run_at_steps, run_every_frame
+from .runner import Begun, RunReport, Timer, Watch, run_at_rate, run_at_steps, run_every_frame
+from .viewer.command import View
 from .voxel import ExactConfig, FiestaConfig, KinectFusionConfig, VoxbloxConfig
+
+if TYPE_CHECKING:
+    from .viewer.watching import Watching
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +45,9 @@ VOXEL_METHODS: dict[str, type[VoxelConfig]] = {
     "fiesta": FiestaConfig,
     "kinectfusion": KinectFusionConfig,
 }
+
+ANEW = ("viewer", "viewer_port", "record", "json")
+"""Options that are no part of a run: given anew when it is resumed."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,12 @@ class Map:
     """Seed of all random draws."""
     threads: int = 1
     """Threads of the matrix library; more than one shortens the wall time but costs CPU time."""
+    viewer: bool = False
+    """Show the map growing in the browser, at an address that is printed; with play, pause and step."""
+    viewer_port: int = 8080
+    """Of the viewer's page; the next free one where it is taken."""
+    record: Path | None = None
+    """Folder for a recording that `isdf view FOLDER` plays."""
     json: bool = False
     """Print the outcome as one line of JSON."""
 
@@ -94,12 +108,14 @@ class Map:
         """Map, then write the results."""
         if self.resume is None:
             return self._map(Begun(RunReport()))
-        if self != Map(resume=self.resume, json=self.json):
+        anew = {name: getattr(self, name) for name in ANEW}
+        if self != Map(resume=self.resume, **anew):
             raise ConfigError(
-                "--resume goes on as the run was started; leave all other options but --json out"
+                "--resume goes on as the run was started; leave all other options but --json, --viewer, "
+                "--viewer-port and --record out"
             )
         begun, options = take_up(self.resume / MAP_FILE)
-        return _restored(options, self.resume)._map(begun)
+        return dataclasses.replace(_restored(options, self.resume), **anew)._map(begun)
 
     def _map(self, begun: Begun) -> Outcome:
         if self.sequence_dir is None or self.out is None:
@@ -108,20 +124,36 @@ class Map:
         torch.set_num_threads(max(1, self.threads))
         sequence, path = open_sequence(self.sequence_dir, self.fps), self.out / MAP_FILE
         sweep(path)
-        with tqdm(total=len(sequence), unit="frame", desc="mapping", disable=None) as bar:
+        with (
+            self._watching(sequence) as watching,
+            tqdm(total=len(sequence), unit="frame", desc="mapping", disable=None) as bar,
+        ):
 
-            def progress(_: OnlineMapper, arrived: int) -> None:
+            def progress(mapper: OnlineMapper, arrived: int) -> None:
                 bar.update(arrived - bar.n)
+                if watching is not None:
+                    watching.update(mapper, arrived, lambda: watch.stopping)
 
             with Checkpointer(path, self.checkpoint_every, begun.report, self._options(), progress) as watch:
                 try:
-                    mapper, report = self._run(sequence, self._config(), watch, begun)
+                    mapper, report = self._run(sequence, self._config(), watch, begun, watching)
                 except Stopped as stopped:
                     if stopped.saved:
                         logger.warning("go on with: isdf map --resume %s", self.out)
                     raise
-        watch.save(mapper, finished=True)
-        return write_results(mapper, report, sequence, self.out, self)
+            watch.save(mapper, finished=True)
+            return write_results(mapper, report, sequence, self.out, self)
+
+    def _watching(self, sequence: DepthSequence) -> contextlib.AbstractContextManager[Watching | None]:
+        """What shows and records the run, if that is asked for."""
+        if not self.viewer and self.record is None:
+            return contextlib.nullcontext()
+        from .viewer.watching import Watching
+
+        watching = Watching(sequence, self.viewer_port if self.viewer else None, self.record, self.up)
+        if watching.viewer is not None:
+            print(f"viewer: {watching.viewer.url}", file=sys.stderr, flush=True)
+        return watching
 
     def _check(self) -> None:
         """Refuse what would fail only after an hour of mapping."""
@@ -142,21 +174,29 @@ class Map:
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         values["sequence_dir"] = str(self.sequence_dir.resolve())
         given = {f.name for f in dataclasses.fields(self) if values[f.name] != f.default}
-        return {name: values[name] for name in sorted(given - {"out", "resume", "json"})}
+        return {name: values[name] for name in sorted(given - {"out", "resume", *ANEW})}
 
     def _run(
-        self, sequence: DepthSequence, config: Config, watch: Watch, begun: Begun
+        self,
+        sequence: DepthSequence,
+        config: Config,
+        watch: Watch,
+        begun: Begun,
+        watching: Watching | None,
     ) -> tuple[OnlineMapper, RunReport]:
+        timer: Timer = time.process_time
+        if watching is not None:
+            sequence, timer = watching.sequence, watching.timer
         if self.steps_per_frame is not None:
-            return run_every_frame(sequence, config, self.steps_per_frame, watch, begun)
+            return run_every_frame(sequence, config, self.steps_per_frame, watch, begun, timer)
         if self.steps_per_second is not None:
             if not isinstance(config, IsdfConfig):
                 raise ConfigError(
                     f"--steps-per-second belongs to --method isdf; {self.method} makes no steps"
                 )
-            return run_at_steps(sequence, config, self.steps_per_second, watch, begun)
+            return run_at_steps(sequence, config, self.steps_per_second, watch, begun, timer)
         rate = 1.0 if self.cpu_per_second is None else self.cpu_per_second
-        return run_at_rate(sequence, config, rate, watch, begun)
+        return run_at_rate(sequence, config, rate, watch, begun, timer)
 
     def _config(self) -> Config:
         if self.method != "isdf":
@@ -191,13 +231,14 @@ def _restored(options: dict[str, Any], out: Path) -> Map:
         ) from None
 
 
-COMMANDS: dict[str, type] = {"map": Map, "query": Query, "export": Export, "info": Info}
+COMMANDS: dict[str, type] = {"map": Map, "query": Query, "export": Export, "info": Info, "view": View}
 
 Command = (
     Annotated[Map, tyro.conf.subcommand("map")]
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[View, tyro.conf.subcommand("view")]
 )
 
 # tyro joins lines that are not indented.
@@ -207,6 +248,7 @@ DESCRIPTION = """Signed distance fields from posed depth images.
   isdf query FOLDER --points P.npy --out ANSWERS.npz   distances and gradients
   isdf export FOLDER --format ply --out MESH.ply       for other programs
   isdf info FOLDER                                     what a map file says
+  isdf view RECORDING                                  in the browser: a recording, or a map
   isdf COMMAND --help                                  the options of a command
   --json: outcome or error as one line of JSON on stdout or stderr
   exit codes:
@@ -236,7 +278,7 @@ def main() -> None:
         _fail(130, "Stopped", "stopped by SIGINT", as_json)
 
 
-def _parsed(words: list[str], as_json: bool) -> Map | Query | Export | Info:
+def _parsed(words: list[str], as_json: bool) -> Map | Query | Export | Info | View:
     """The command that the words ask for.
 
     Raises:

@@ -45,3 +45,7 @@ class EvaluationError(IsdfError):
 
 class SourceError(IsdfError):
     """A live camera cannot be opened, or its images have stopped coming."""
+
+
+class ViewerError(IsdfError):
+    """The viewer cannot be opened, or a recording cannot be read."""

@@ -16,6 +16,8 @@ logger = logging.getLogger(__name__)
 
 Watch = Callable[[OnlineMapper, int], None]
 """Called with the mapper and the number of frames that have arrived; what it does costs the mapper no time."""
+Timer = Callable[[], float]
+"""CPU time used so far [s]: `time.process_time`, less that of threads which do not belong to mapping."""
 
 
 @dataclass
@@ -50,31 +52,36 @@ class Begun:
 class _Stopwatch:
     """CPU and wall seconds spent on mapping, without what the watcher uses; kept up to date in the report."""
 
-    def __init__(self, watch: Watch, report: RunReport) -> None:
-        self._watch, self._report = watch, report
-        self._cpu = time.process_time() - report.cpu_seconds
+    def __init__(self, watch: Watch, report: RunReport, timer: Timer) -> None:
+        self._watch, self._report, self._timer = watch, report, timer
+        self._cpu = timer() - report.cpu_seconds
         self._wall = time.perf_counter() - report.wall_seconds
 
     @property
     def cpu(self) -> float:
-        return time.process_time() - self._cpu
+        return self._timer() - self._cpu
 
     @property
     def wall(self) -> float:
         return time.perf_counter() - self._wall
 
     def watch(self, mapper: OnlineMapper, arrived: int) -> None:
-        cpu, wall = time.process_time(), time.perf_counter()
+        cpu, wall = self._timer(), time.perf_counter()
         report = self._report
         report.cpu_seconds, report.wall_seconds = self.cpu, self.wall
         report.frames_arrived, report.steps = arrived, mapper.steps
         self._watch(mapper, arrived)
-        self._cpu += time.process_time() - cpu
+        self._cpu += self._timer() - cpu
         self._wall += time.perf_counter() - wall
 
 
 def run_every_frame(
-    sequence: DepthSequence, config: Config, steps_per_frame: int, watch: Watch, begun: Begun | None = None
+    sequence: DepthSequence,
+    config: Config,
+    steps_per_frame: int,
+    watch: Watch,
+    begun: Begun | None = None,
+    timer: Timer = time.process_time,
 ) -> tuple[OnlineMapper, RunReport]:
     """Every frame is integrated and given exactly `steps_per_frame` steps, however long they take.
 
@@ -87,7 +94,7 @@ def run_every_frame(
             config, first_frame_steps=steps_per_frame, steps_per_frame=steps_per_frame, keyframe_steps=0
         )
     mapper, report = _take_up(begun, config)
-    spent = _Stopwatch(watch, report)
+    spent = _Stopwatch(watch, report, timer)
     for index in range(report.frames_arrived, len(sequence)):
         _integrate(mapper, sequence, index, report)
         spent.watch(mapper, index + 1)
@@ -100,6 +107,7 @@ def run_at_steps(
     steps_per_second: float,
     watch: Watch,
     begun: Begun | None = None,
+    timer: Timer = time.process_time,
 ) -> tuple[OnlineMapper, RunReport]:
     """As on a machine that makes so many steps a second, whatever this one makes (the paper's GPU made about 30).
 
@@ -112,7 +120,7 @@ def run_at_steps(
     if config.steps_per_frame < 1:
         raise ConfigError("the clock stands still with steps_per_frame = 0; give at least 1")
     mapper, report = _take_up(begun, config)
-    spent = _Stopwatch(watch, report)
+    spent = _Stopwatch(watch, report, timer)
     index = report.frames_arrived
     while index < len(sequence):
         refused = not _integrate(mapper, sequence, index, report)
@@ -124,7 +132,12 @@ def run_at_steps(
 
 
 def run_at_rate(
-    sequence: DepthSequence, config: Config, cpu_per_second: float, watch: Watch, begun: Begun | None = None
+    sequence: DepthSequence,
+    config: Config,
+    cpu_per_second: float,
+    watch: Watch,
+    begun: Begun | None = None,
+    timer: Timer = time.process_time,
 ) -> tuple[OnlineMapper, RunReport]:
     """Live: at most `cpu_per_second` CPU seconds for each second of sequence.
 
@@ -139,7 +152,7 @@ def run_at_rate(
         live = replace(config, first_frame_steps=0, steps_per_frame=0, keyframe_steps=0)
         frame_steps = config.steps_per_frame
     mapper, report = _take_up(begun, live)
-    spent = _Stopwatch(watch, report)
+    spent = _Stopwatch(watch, report, timer)
     budget = len(sequence) / sequence.fps * cpu_per_second
     patience, last = frame_steps, report.frames_arrived - 1
     while (used := spent.cpu + report.waited_seconds) < budget:

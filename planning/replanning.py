@@ -123,6 +123,7 @@ class ReplanningLoop:
         self.plan: PlanResult | None = None
         self.field: DistanceField | None = None
         self.report = DriveReport()
+        self.goal: ndarray = np.full(2, math.nan)
         self.last_planning = 0.0
         self._frame: Any = None
         self._owed = self._held = self._started = 0.0
@@ -140,13 +141,13 @@ class ReplanningLoop:
             final_yaw: heading to end with [rad]; any if None.
         """
         started, self.report, self.plan = self.robot.time, DriveReport(), None
-        self._started = started
+        self.goal, self._started = np.array(goal, dtype=float), started
         self._failures, self._retry_at, self._to_goal, self._held = 0, -math.inf, False, 0.0
         self.planner.forget()
         self._scan()
         self.tracker.reset()
         while self.robot.time - started < self.config.time_limit:
-            spent = self._sense_and_map()
+            goal, spent = self.goal, self._sense_and_map()
             leads_to_goal = self.plan is not None and self._to_goal
             fresh, planning = self._plan_if_needed(goal)
             self._follow(spent + planning, final_yaw)
@@ -154,7 +155,7 @@ class ReplanningLoop:
             self.report.rounds += 1
             if self.watch:
                 self.watch(self)
-            if leads_to_goal and self.tracker.finished:
+            if leads_to_goal and self.tracker.finished and goal is self.goal:
                 self._end(DriveStatus.REACHED, "the base stands on the goal")
                 break
             if self._failures > self.config.patience:
@@ -165,8 +166,20 @@ class ReplanningLoop:
             self._end(DriveStatus.TIME_LIMIT, f"not there after {self.config.time_limit:g} s{reason}")
         self.robot.drive(0.0, 0.0, self.config.tracker.period)
         self.report.duration = self.robot.time - started
-        self.report.goal_distance = float(np.linalg.norm(self.robot.base_state()[:2] - goal))
+        self.report.goal_distance = float(np.linalg.norm(self.robot.base_state()[:2] - self.goal))
         return self.report
+
+    def change_goal(self, goal: Float[ndarray, "2"]) -> None:
+        """Drive to another goal x, y [m] from the next round on; for `watch` to call while a drive goes on."""
+        self.goal, self.plan, self._to_goal = np.array(goal, dtype=float), None, False
+        self._failures, self._retry_at, self._held = 0, -math.inf, 0.0
+        self.planner.forget()
+        self.report.note(self.robot.time - self._started, f"the goal is now {goal[0]:.2f}, {goal[1]:.2f}")
+
+    @property
+    def leads_to_goal(self) -> bool:
+        """Whether there is a plan and it ends at the goal, not only nearer to it."""
+        return self.plan is not None and self._to_goal
 
     def _scan(self) -> None:
         """Turn on the spot and map what comes into view."""

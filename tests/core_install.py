@@ -13,7 +13,7 @@ import isdf
 import planning
 from tests.isdf.rooms import furnished_orbit, furnished_room
 
-OPTIONAL = ("pybullet", "casadi", "pytorch_kinematics", "rosbags", "embreex", "pyrealsense2")
+OPTIONAL = ("pybullet", "casadi", "pytorch_kinematics", "rosbags", "embreex", "pyrealsense2", "viser")
 
 
 class Ball:

@@ -47,6 +47,19 @@ class Recording:
         """Where a mobile base was, (x, y, yaw) [m, m, rad]: the first three joints of every posture."""
         return np.array([posture[:3] for posture in self._postures]).reshape(-1, 3)
 
+    def postures(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n dof"]]:
+        """Times [s] and joint positions of every state, in the order of the robot's `joint_names`."""
+        return np.array(self._times), np.array(self._postures).reshape(
+            len(self), len(self.world.robot.joint_names)
+        )
+
+    def heights(self, name: str) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Times [s], and how high [m] the origin of a body with a mass was then."""
+        found = [
+            (t, state[name][2, 3]) for t, state in zip(self._times, self._poses, strict=True) if name in state
+        ]
+        return np.array([t for t, _ in found]), np.array([z for _, z in found])
+
     def touched(self, ignore: tuple[str, ...] = ()) -> dict[str, float]:
         """Deepest penetration [m] of each pair "link - body" that touched, but for the named bodies."""
         deepest: dict[str, float] = {}
@@ -64,9 +77,9 @@ class Recording:
         were moved or added, NaN while they are not in the world.
         """
         names = self.world.robot.joint_names
-        postures = np.array(self._postures).reshape(len(self), len(names))
+        times, postures = self.postures()
         arrays = {
-            "time": np.array(self._times),
+            "time": times,
             "joint_names": np.array(names),
             "joint_positions": postures,
             "object_names": np.array(list(self._movers), dtype=str),

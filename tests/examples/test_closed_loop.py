@@ -62,10 +62,12 @@ def assert_complete(report: dict, out: Path) -> None:
     assert saved["joint_positions"].shape == (n, len(saved["joint_names"]))
     assert saved["object_poses"].shape == (n, len(saved["object_names"]), 4, 4)
     assert all(np.isfinite(saved[key]).all() for key in ("time", "joint_positions", "object_poses"))
-    with Image.open(out / "map.png") as picture:
-        picture.load()
-        assert min(picture.size) > 300
-        assert np.asarray(picture.convert("L")).std() > 10, "the picture shows something"
+    for name in ("map.png", "summary.png"):
+        with Image.open(out / name) as picture:
+            picture.load()
+            assert min(picture.size) > 300
+            assert np.asarray(picture.convert("L")).std() > 10, "the picture shows something"
+    assert "summary.png" in (out / "report.html").read_text()
     assert (out / "map.safetensors").stat().st_size > 10_000
     assert not (out / "episode.gif").exists()
 

@@ -11,6 +11,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from isdf.checkpointing import Checkpointer, Stopped, take_up
 from isdf.cli import main
 from isdf.datasets import RecordedSequence, SequenceWriter
 from isdf.runner import Begun, RunReport, run_at_rate, run_every_frame
+from isdf.viewer import Controls
 from isdf.voxel import ExactConfig, ExactMapper
 from tests.isdf.rooms import furnished_orbit
 
@@ -228,3 +230,28 @@ def test_a_resume_trusts_no_file(run, fault, tmp_path, monkeypatch, capsys) -> N
     with pytest.raises(SystemExit) as exit_info:
         main()
     assert exit_info.value.code == 2 and fault in capsys.readouterr().err
+
+
+def test_a_run_that_is_paused_stops_when_asked_to_and_pauses_count_as_no_slow_frames(tmp_path) -> None:
+    controls, mapper, report = Controls(), ExactMapper(ExactConfig()), RunReport()
+    mapper.integrate(furnished_orbit(12)[0])
+    mapper.refresh()
+    path = tmp_path / "map.safetensors"
+
+    def paused(_: object, arrived: int) -> None:
+        controls.hold(lambda: not watch.stopping and time.monotonic() < end)
+
+    with Checkpointer(path, 100.0, report, {}, paused) as watch:
+        end = time.monotonic() + 0.5
+        watch(mapper, 1)
+        controls.pause()
+        watch(mapper, 2)
+        watch(mapper, 3)
+        assert watch._gap < 0.3, "half a second of pause is no frame's"
+        end = time.monotonic() + 20.0
+        threading.Timer(0.2, os.kill, [os.getpid(), signal.SIGTERM]).start()
+        began = time.monotonic()
+        with pytest.raises(Stopped):
+            watch(mapper, 4)
+        assert time.monotonic() - began < 5.0
+    assert load_map(path).frames_seen == 1

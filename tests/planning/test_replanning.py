@@ -285,3 +285,43 @@ def test_what_the_map_only_takes_for_blocked_is_explored_through_the_doorway() -
     _, report = drive(robot, knows, config)
     assert seen and report.success
     assert robot.clearance(BODY, wall) > -0.01
+
+
+def test_a_goal_that_is_changed_on_the_way_is_driven_to_instead() -> None:
+    robot, there = Unicycle(), np.array([1.2, -1.4])
+
+    def watch(loop: ReplanningLoop) -> None:
+        if loop.plan is not None and robot.state[0] > 0.5 and loop.goal[0] == GOAL[0]:
+            assert loop.leads_to_goal
+            loop.change_goal(there)
+            assert loop.plan is None and not loop.leads_to_goal
+
+    _, report = drive(robot, PILLAR, watch=watch)
+    assert report.success and np.linalg.norm(robot.state[:2] - there) < 0.05
+    assert report.goal_distance < 0.05 and places(robot)[:, 0].max() < GOAL[0] - 1.0
+    assert any("the goal is now 1.20, -1.40" in event for event in report.events)
+    assert robot.clearance(BODY, PILLAR) > 0
+
+
+def test_a_goal_changed_at_the_last_moment_is_not_taken_for_the_one_that_was_reached() -> None:
+    robot, there, asked = Unicycle(), np.array([1.0, 0.8]), []
+
+    def watch(loop: ReplanningLoop) -> None:
+        if loop.tracker.finished and not asked:
+            asked.append(loop.robot.time)
+            loop.change_goal(there)
+
+    _, report = drive(robot, FREE, watch=watch)
+    assert asked and report.success and np.linalg.norm(robot.state[:2] - there) < 0.05
+
+
+def test_a_goal_moved_into_an_obstacle_is_reported_and_not_driven_to() -> None:
+    robot = Unicycle()
+
+    def watch(loop: ReplanningLoop) -> None:
+        if loop.plan is not None and loop.goal[0] == GOAL[0]:
+            loop.change_goal(np.array([1.5, 0.1]))
+
+    _, report = drive(robot, PILLAR, config=replace(QUICK, time_limit=20.0), watch=watch)
+    assert not report.success and report.message
+    assert robot.clearance(BODY, PILLAR) > 0
