@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,13 +22,13 @@ from planning.clock import Clock, MeasuredClock, OnlineMap
 from planning.collision_monitor import CollisionMonitor
 from planning.drive import DriveReport, DriveStatus, MobileRobot
 from planning.errors import ConfigError
+from planning.gaze import Gaze, GazeConfig
 from planning.grid_search import Route
 from planning.protocols import DistanceField, SphereRobot
 from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
 
 logger = logging.getLogger(__name__)
-T = TypeVar("T")
 
 # The base has made progress since a failure when it is this far from where it stood then [m].
 PROGRESS = 0.1
@@ -46,11 +46,7 @@ class ReplanningConfig:
         scan: angle [rad] turned on the spot at the start, to see what is around.
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
-        look_ahead: distance along the path [m] at which the camera looks.
-        look_near: distance [m] at which it looks at the floor, too, while it turns on the spot.
-        look_heights: heights [m] there between which it nods: no view is wide enough to see both what stands on the
-            floor and what hangs as high as the robot's head.
-        nod: time [s] at each of them.
+        gaze: where the camera looks.
         extend: a plan that ends before unknown space is made anew when this much [m] less of the way is unknown.
         stuck: the plan is given up when the collision monitor has held the base for this long [s].
         patience: plans that may fail, or not be followed, without progress before the goal is called unreachable.
@@ -62,26 +58,18 @@ class ReplanningConfig:
     scan: float = 2 * math.pi
     scan_rate: float = 0.5
     retry: float = 1.0
-    look_ahead: float = 1.5
-    look_near: float = 0.7
-    look_heights: tuple[float, ...] = (0.0, 1.1)
-    nod: float = 0.5
+    gaze: GazeConfig = field(default_factory=GazeConfig)
     extend: float = 0.5
     stuck: float = 2.0
     patience: int = 15
     time_limit: float = 180.0
 
     def __post_init__(self) -> None:
-        if not min(self.scan_rate, self.retry, self.stuck, self.time_limit) > 0:
+        if not min(self.scan_rate, self.retry, self.extend, self.stuck, self.time_limit) > 0:
             raise ConfigError(
-                "ReplanningConfig: scan_rate, retry, stuck and time_limit must be positive, got "
-                f"{self.scan_rate:g} rad/s, {self.retry:g} s, {self.stuck:g} s and {self.time_limit:g} s."
-            )
-        if not self.look_heights or not min(self.look_ahead, self.look_near, self.nod, self.extend) > 0:
-            raise ConfigError(
-                "ReplanningConfig: look_heights must not be empty, and look_ahead, look_near, nod and extend must be "
-                f"positive, got {self.look_heights}, {self.look_ahead:g} m, {self.look_near:g} m, {self.nod:g} s and "
-                f"{self.extend:g} m."
+                "ReplanningConfig: scan_rate, retry, extend, stuck and time_limit must be positive, got "
+                f"{self.scan_rate:g} rad/s, {self.retry:g} s, {self.extend:g} m, {self.stuck:g} s and "
+                f"{self.time_limit:g} s."
             )
 
 
@@ -120,6 +108,7 @@ class ReplanningLoop:
         self.watch, self.monitor = watch, monitor
         self.planner = BasePlanner(body, self.config.planner, seed)
         self.tracker = BaseTracker(self.config.tracker)
+        self.gaze = Gaze(robot, self.config.gaze)
         self.plan: PlanResult | None = None
         self.field: DistanceField | None = None
         self.report = DriveReport()
@@ -186,7 +175,8 @@ class ReplanningLoop:
         rate, started = self.config.scan_rate, self.robot.time
         while rate * (self.robot.time - started) < self.config.scan:
             spent = self._sense_and_map()
-            self._ahead(self.robot.base_state())
+            state = self.robot.base_state()
+            self.gaze.towards(state[:2], state[2])
             self._pass_time(spent, lambda _: (0.0, rate))
             if self.watch:
                 self.watch(self)
@@ -265,7 +255,7 @@ class ReplanningLoop:
         path = self.plan.trajectory.waypoints.numpy().astype(float)
 
         def command(state: ndarray) -> tuple[float, float]:
-            self._look_along(path, state)
+            self.gaze.along(path, state)
             return self.tracker.command(state, path, None, final_yaw)
 
         self._pass_time(duration, command)
@@ -322,37 +312,17 @@ class ReplanningLoop:
 
         The next attempt waits until the camera faces that way.
         """
-        far = self._onward[np.linalg.norm(self._onward - state[:2], axis=1) > self.config.look_near]
+        far = self._onward[np.linalg.norm(self._onward - state[:2], axis=1) > self.config.gaze.near]
         if len(far) == 0:
-            self._ahead(state)
+            self.gaze.towards(state[:2], state[2])
             return self.config.scan_rate
         away = far[0] - state[:2]
-        error = math.remainder(math.atan2(away[1], away[0]) - state[2], 2 * math.pi)
-        self._ahead(np.array([*state[:2], state[2] + error]))
+        heading = math.atan2(away[1], away[0])
+        error = math.remainder(heading - state[2], 2 * math.pi)
+        self.gaze.towards(state[:2], heading)
         if abs(error) > FACING:
             self._retry_at = max(self._retry_at, self.robot.time + self.config.retry)
         return float(np.clip(error, -self.config.scan_rate, self.config.scan_rate))
-
-    def _look_along(self, path: Float[ndarray, "n 2"], state: ndarray) -> None:
-        """Look at the floor where the path will lead, or ahead where it ends."""
-        nearest = int(np.linalg.norm(path - state[:2], axis=1).argmin())
-        along = np.r_[0.0, np.linalg.norm(np.diff(path[nearest:], axis=0), axis=1).cumsum()]
-        if along[-1] < 0.5:
-            self._ahead(state)
-            return
-        target = path[nearest + int(np.searchsorted(along, self.config.look_ahead).clip(0, len(along) - 1))]
-        self.robot.look_at(np.array([*target, self._nod(self.config.look_heights)]))
-
-    def _ahead(self, state: ndarray) -> None:
-        """Look the way the base faces, and at the floor before it, too: to see where it could drive off."""
-        far = [(self.config.look_ahead, height) for height in self.config.look_heights]
-        distance, height = self._nod([(self.config.look_near, 0.0), *far])
-        direction = np.array([math.cos(state[2]), math.sin(state[2])])
-        self.robot.look_at(np.array([*(state[:2] + distance * direction), height]))
-
-    def _nod(self, between: Sequence[T]) -> T:
-        """One of the things to look at in turn."""
-        return between[int(self.robot.time / self.config.nod) % len(between)]
 
     def _end(self, status: DriveStatus, message: str) -> None:
         self.report.status, self.report.message = status, message

@@ -14,6 +14,7 @@ from torch import Tensor
 from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.drive import DriveStatus
 from planning.explored import ExploredField
+from planning.gaze import GazeConfig
 from planning.protocols import ObservingField
 from planning.replanning import ReplanningLoop
 from tests.planning.fields import AutogradField, Box, Confident
@@ -149,14 +150,14 @@ def test_the_camera_nods() -> None:
     robot = Unicycle()
     drive(robot, FREE)
     heights = np.array(robot.looked_at)[:, 2]
-    assert set(heights.tolist()) == set(QUICK.look_heights)
+    assert set(heights.tolist()) == set(QUICK.gaze.heights)
     assert np.flatnonzero(np.diff(heights)).size > 4
 
 
-@pytest.mark.parametrize("values", [{"nod": 0.0}, {"look_heights": ()}, {"extend": 0.0}, {"look_near": 0.0}])
+@pytest.mark.parametrize("values", [{"nod": 0.0}, {"heights": ()}, {"ahead": -1.0}, {"near": 0.0}])
 def test_bad_ways_of_looking_are_refused(values: dict) -> None:
     with pytest.raises(Exception, match=next(iter(values))):
-        replace(QUICK, **values)
+        GazeConfig(**values)
 
 
 @pytest.mark.parametrize("values", [{"room": 0.0}, {"memory": -1.0}])
