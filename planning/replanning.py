@@ -132,6 +132,7 @@ class ReplanningLoop:
         started, self.report, self.plan = self.robot.time, DriveReport(), None
         self.goal, self._started = np.array(goal, dtype=float), started
         self._failures, self._retry_at, self._to_goal, self._held = 0, -math.inf, False, 0.0
+        self._onward = self._onward[:0]
         self.planner.forget()
         self._scan()
         self.tracker.reset()
@@ -161,7 +162,7 @@ class ReplanningLoop:
     def change_goal(self, goal: Float[ndarray, "2"]) -> None:
         """Drive to another goal x, y [m] from the next round on; for `watch` to call while a drive goes on."""
         self.goal, self.plan, self._to_goal = np.array(goal, dtype=float), None, False
-        self._failures, self._retry_at, self._held = 0, -math.inf, 0.0
+        self._failures, self._retry_at, self._held, self._onward = 0, -math.inf, 0.0, self._onward[:0]
         self.planner.forget()
         self.report.note(self.robot.time - self._started, f"the goal is now {goal[0]:.2f}, {goal[1]:.2f}")
 
