@@ -10,8 +10,6 @@ page, between `<!-- NAME -->` and `<!-- /NAME -->`, and the pictures go to image
 from __future__ import annotations
 
 import json
-import re
-import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,6 +24,7 @@ if not __package__:  # run as a file
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import tables
+from benchmarks.publishing import publish
 from benchmarks.shading import dollhouse
 from benchmarks.tables import NAMES, Result
 from isdf.datasets import open_sequence
@@ -79,7 +78,7 @@ def main(options: Options) -> list[Path]:
         for name in tqdm(tables.sequences(results["main"]), desc="pictures", unit="sequence", disable=None):
             written += _pictures(options, report, name, results["main"])
     if options.publish:
-        _publish(options.publish, parts, sorted(report.glob("*.png")))
+        publish(options.publish, parts, sorted(report.glob("*.png")))
     return written
 
 
@@ -206,20 +205,6 @@ def _pictures(options: Options, folder: Path, name: str, results: Sequence[Resul
     }
     save_picture_row(meshes, views)
     return [slices, meshes]
-
-
-def _publish(page: Path, parts: dict[str, str], pictures: list[Path]) -> None:
-    """Put tables between their marks in the page, and the pictures it shows into images/results beside it."""
-    text = page.read_text()
-    for name, table in parts.items():
-        marked = re.compile(rf"(<!-- {re.escape(name)} -->\n).*?(<!-- /{re.escape(name)} -->)", re.DOTALL)
-        text = marked.sub(lambda found, table=table: f"{found[1]}\n{table}\n{found[2]}", text)
-    page.write_text(text)
-    folder = page.parent / "images" / "results"
-    folder.mkdir(parents=True, exist_ok=True)
-    for picture in pictures:
-        if f"images/results/{picture.name}" in text:
-            shutil.copy(picture, folder / picture.name)
 
 
 if __name__ == "__main__":
