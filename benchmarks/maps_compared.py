@@ -50,8 +50,8 @@ def main(options: Options) -> str:
     found = read_reports(options.out / options.scene, options.disturb)
     if len(found) < 2:
         raise SystemExit(
-            f"{options.out / options.scene}: needs episodes of two maps or more with --disturb {options.disturb}, found "
-            f"those of {', '.join(found) or 'none'}; run `python -m benchmarks.closed_loop navigate --method MAP` first"
+            f"{options.out / options.scene}: needs episodes of two maps or more with --disturb {options.disturb}, "
+            f"found those of {', '.join(found) or 'none'}; run `python -m benchmarks.closed_loop navigate --method MAP` first"
         )
     text, picture = table(found), options.out / "maps.png"
     (options.out / "maps.md").write_text(text)
@@ -136,14 +136,15 @@ def save_picture(path: Path, found: dict[str, Reports]) -> None:
     """A panel a figure, a bar a map."""
     figure = Figure(figsize=(11.0, 2.6), layout="constrained")
     names = [_name(method) for method in found]
-    for ax, title in zip(figure.subplots(1, len(PANELS), sharey=True), PANELS, strict=True):
+    panels = figure.subplots(1, len(PANELS), sharey=True)
+    panels[0].invert_yaxis()
+    for ax, title in zip(panels, PANELS, strict=True):
         value, form = COLUMNS[title]
         values = [value(reports) for reports in found.values()]
         bars = ax.barh(names, np.nan_to_num(values), color=[f"C{i}" for i in range(len(names))])
         ax.bar_label(bars, [f"{v:{form}}" if np.isfinite(v) else "-" for v in values], padding=2, fontsize=8)
         ax.set_title(title, fontsize=9)
         ax.margins(x=0.25)
-        ax.invert_yaxis() if ax.get_subplotspec().is_first_col() else None
     save_small(figure, path, 90)
 
 

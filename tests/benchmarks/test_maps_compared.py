@@ -58,7 +58,7 @@ def test_an_episode_that_ended_in_an_error_counts_as_not_reached(tmp_path: Path)
 def test_one_map_is_nothing_to_compare(tmp_path: Path) -> None:
     write(tmp_path, "default", 0)
     assert list(read_reports(tmp_path / "hall", "none")) == ["default"]
-    with pytest.raises(SystemExit, match="two maps or more.*found those of default"):
+    with pytest.raises(SystemExit, match=r"two maps or more.*found those of default"):
         main(Options(tmp_path, "hall"))
     with pytest.raises(SystemExit, match="found those of none"):
         main(Options(tmp_path, "hall", disturb="people"))
