@@ -51,7 +51,7 @@ def main(options: Options) -> str:
     if len(found) < 2:
         raise SystemExit(
             f"{options.out / options.scene}: needs episodes of two maps or more with --disturb {options.disturb}, "
-            f"found those of {', '.join(found) or 'none'}; run `python -m benchmarks.closed_loop navigate --method MAP` first"
+            f"found those of {', '.join(found) or 'none'}; run benchmarks.closed_loop navigate --method MAP first"
         )
     text, picture = table(found), options.out / "maps.png"
     (options.out / "maps.md").write_text(text)
