@@ -24,7 +24,7 @@ CONTROL_PERIOD = 0.02
 # The share of the URDF's speed limits the arm uses, and its accelerations [rad/s^2 | m/s^2].
 SPEED_SHARE, ACCELERATION = 0.4, 1.0
 HAND = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
-ARM_ROOM = 0.005
+ARM_ROOM = 0.015
 """Of arm and torso on the straight lines [m]; the hand's is judged in the finer map."""
 
 
