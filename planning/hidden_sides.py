@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter, grey_closing
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from planning.line_of_sight import in_sight
@@ -23,7 +24,7 @@ def hidden_sides(
     """Upright walls where a thing ends out of sight.
 
     Every column of space is filled from the support up to the highest point that was seen in it, but for what was
-    seen to be free. Where the filling ends beside unseen space, a wall is guessed.
+    seen to be free. Where the filling ends sideways without a measured point, a wall is guessed.
 
     Args:
         field: the map.
@@ -43,7 +44,10 @@ def hidden_sides(
     free = _seen_free(field, centres, eyes).numpy().reshape(*top.shape, layers)
     heights = (np.arange(layers) + 0.5) * CELL
     filled = (heights < top[..., None]) & ~free
-    return _walls(filled, free, corner)
+    sides, normals = _walls(filled, corner)
+    away, _ = cKDTree(points.numpy()).query(sides.numpy())
+    guessed = torch.from_numpy(away > 1.5 * CELL)
+    return sides[guessed], normals[guessed]
 
 
 def _tops(points: Tensor, corner: Tensor) -> np.ndarray:
@@ -61,14 +65,14 @@ def _seen_free(field: DistanceField, centres: Tensor, eyes: Tensor) -> Bool[Tens
     return empty
 
 
-def _walls(filled: np.ndarray, free: np.ndarray, corner: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the filling ends sideways at unseen space; normals from the slope of the smoothed filling."""
+def _walls(filled: np.ndarray, corner: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the filling ends sideways; normals from the slope of the smoothed filling."""
     smooth = gaussian_filter(filled.astype(np.float32), (1.5, 1.5, 1.0))
     slope = -np.stack(np.gradient(smooth, axis=(0, 1)), axis=-1)
     at_edge = np.zeros_like(filled)
     for axis in (0, 1):
         for way in (1, -1):
-            at_edge |= filled & ~np.roll(filled | free, -way, axis=axis)
+            at_edge |= filled & ~np.roll(filled, -way, axis=axis)
     wall = np.argwhere(at_edge)
     normal = torch.from_numpy(slope[tuple(wall.T)]).float()
     normal = torch.nn.functional.normalize(torch.nn.functional.pad(normal, (0, 1)), dim=1)

@@ -38,12 +38,12 @@ class Turned(AutogradField):
 
 
 class Shell(AutogradField):
-    """What a map knows of a field from one place: a shell of some centimetres, and nothing solid behind it."""
+    """What a map knows of a thing: a shell of a centimetre or two, and nothing solid in it."""
 
-    THICK = 0.03
+    THICK = 0.02
 
-    def __init__(self, field: AutogradField, eye: tuple[float, float, float]) -> None:
-        self.field, self.eye = field, torch.tensor(eye)
+    def __init__(self, field: AutogradField) -> None:
+        self.field = field
 
     def distance(self, points):
         distance = self.field.distance(points)
@@ -123,7 +123,7 @@ ABOVE = torch.tensor([[0.0, -0.7, 1.1], [0.0, 0.0, 1.8]])
 
 
 def test_lines_of_sight_tell_the_front_from_the_back() -> None:
-    field = Shell(Union(TABLE, carton()), (0.0, -0.7, 1.1))
+    field = Shell(Union(TABLE, carton()))
     near, far = torch.tensor([[0.0, -0.077, 0.78]]), torch.tensor([[0.0, 0.077, 0.78]])
     inside = torch.tensor([[0.0, -0.03, 0.76]])
     assert bool(in_sight(field, near, FRONT)) and not bool(in_sight(field, far, FRONT))
@@ -136,10 +136,10 @@ def test_lines_of_sight_tell_the_front_from_the_back() -> None:
 @pytest.mark.parametrize("yaw", [0.0, 0.5])
 def test_sides_that_nobody_saw_go_down_from_the_top(yaw: float) -> None:
     """From the front a map has a shell; its back is no face of the thing, and the thing's back is guessed."""
-    field = Shell(Union(TABLE, carton(yaw)), (0.0, -0.7, 1.1))
+    field = Shell(Union(TABLE, carton(yaw)))
     surface = object_surface(field, torch.tensor([0.0, 0.0, 0.823]), FRONT)
     assert surface is not None
-    assert carton(yaw).distance(surface.points).abs().max() < 0.012
+    assert carton(yaw).distance(surface.points).abs().max() < 0.012, "the back of the shell is left out"
     assert carton(yaw).distance(surface.points).abs().median() < 0.003
     behind = torch.tensor([-math.sin(yaw), math.cos(yaw), 0.0])
     back = surface.points[(surface.points @ behind > 0.065) & (surface.points[:, 2] < 0.79)]
@@ -169,7 +169,7 @@ def test_fingers_stay_out_of_space_that_nobody_saw() -> None:
     assert not bool(RoomRound(broad, object_surface(broad, at, ABOVE)).hidden(low))
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.02])
+@pytest.mark.parametrize("tilt", [0.0, 0.04])
 def test_flat_things_are_taken_from_above(tilt: float) -> None:
     """A ruler 12 mm high, on a table that a camera's distortion tilts: the fingers end just above it."""
     height = 0.012
@@ -177,6 +177,7 @@ def test_flat_things_are_taken_from_above(tilt: float) -> None:
     at = torch.tensor([0.0, 0.0, 0.7 + height])
     surface = object_surface(field, at)
     assert surface is not None and surface.support == pytest.approx(0.7, abs=0.002)
+    assert surface.points[:, 1].abs().max() < 0.016, "neither half of the table is part of it"
     assert field.distance(surface.points).abs().max() < 0.004
     assert surface.points[:, 0].max() - surface.points[:, 0].min() == pytest.approx(0.2, abs=0.012)
     grasps = find_grasps(field, surface, HAND)
