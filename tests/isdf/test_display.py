@@ -47,7 +47,9 @@ def test_colours_fit_the_size_of_what_is_drawn() -> None:
     limits = []
     for half in (0.2, 0.5, 10.0):
         region = torch.tensor([[-half, -half, 0.0], [half, half, 1.0]])
-        low, high = isdf.plot_slice(ball(), 0.5, bounds=region, spacing=half / 20).axes[0].images[0].get_clim()
+        low, high = (
+            isdf.plot_slice(ball(), 0.5, bounds=region, spacing=half / 20).axes[0].images[0].get_clim()
+        )
         assert low == -high
         limits.append(high)
     assert limits[0] < 0.2 and limits[0] < limits[1] < limits[2] == 1.5
