@@ -12,7 +12,8 @@ from torch import Tensor
 import planning
 import robots
 from examples.disturbances import DisturbedRobot
-from planning.grasping import GraspConfig, Grasps, ParallelHand
+from planning.grasping import GraspConfig, Grasps
+from planning.hand_room import ParallelHand
 from planning.protocols import DistanceField
 from planning.workspace import Workspace
 from robots.fine_cover import fine_cover

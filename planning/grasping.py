@@ -27,6 +27,8 @@ OUTLIERS = 2
 """So many points on either side of a grasp may stick out, and are noise."""
 SHALLOW = 0.006
 """Fingers that reach less far over an object [m] hold nothing."""
+LEVER = 8.0
+"""What a grasp's score loses for each metre that it is away from the middle."""
 UNSEEN = 1.5
 """What a grasp's score loses if a finger is in unseen space altogether."""
 
@@ -244,14 +246,14 @@ def _extent(values: Tensor, mask: Tensor) -> Tensor:
 def _score(
     T: Tensor, width: Tensor, antipodal: Tensor, surface: ObjectSurface, hand: ParallelHand, heading: float
 ) -> Float[Tensor, " n"]:
-    """Opposite faces count most, then being near the middle, play for the fingers, and the robot's side."""
-    low, high = surface.points.amin(dim=0), surface.points.amax(dim=0)
-    middle = (low + high) / 2
-    away = (T[:, :3, 3] - middle) / (high - low).norm()
-    beside = away[:, :2].norm(dim=1) + 0.5 * away[:, 2].abs()
+    """Opposite faces count, being near the middle, where weight does not turn the thing in the hand, play for the
+    fingers, and the robot's side.
+    """
+    away = T[:, :3, 3] - surface.middle
+    beside = away[:, :2].norm(dim=1) + 0.3 * away[:, 2].abs()
     tight = (width / hand.opening - 0.75).clamp_min(0.0)
     towards = T[:, 0, 2] * math.cos(heading) + T[:, 1, 2] * math.sin(heading)
-    return 5.0 * antipodal - 0.8 * beside - 0.5 * tight + 0.3 * towards
+    return 5.0 * antipodal - LEVER * beside - 0.5 * tight + 0.3 * towards
 
 
 def _with_room(room: RoomRound, grasps: Grasps, hand: ParallelHand, config: GraspConfig) -> Grasps:

@@ -20,7 +20,7 @@ BORDER = 3
 
 def hidden_sides(
     field: DistanceField, points: Float[Tensor, "n 3"], support: float, eyes: Float[Tensor, "k 3"]
-) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "3"]]:
     """Upright walls where a thing ends out of sight.
 
     Every column of space is filled from the support up to the highest point that was seen in it, but for what was
@@ -33,7 +33,7 @@ def hidden_sides(
         eyes: where the camera was [m].
 
     Returns:
-        Points of the walls [m] and their level unit normals, outwards.
+        Points of the walls [m], their level unit normals, outwards, and the middle of the filling [m].
     """
     corner = points.amin(dim=0) - BORDER * CELL
     corner[2] = support
@@ -44,10 +44,11 @@ def hidden_sides(
     free = _seen_free(field, centres, eyes).numpy().reshape(*top.shape, layers)
     heights = (np.arange(layers) + 0.5) * CELL
     filled = (heights < top[..., None]) & ~free
+    middle = corner + CELL * (torch.from_numpy(np.argwhere(filled)).float().mean(dim=0) + 0.5)
     sides, normals = _walls(filled, corner)
     away, _ = cKDTree(points.numpy()).query(sides.numpy())
     guessed = torch.from_numpy(away > 1.5 * CELL)
-    return sides[guessed], normals[guessed]
+    return sides[guessed], normals[guessed], middle
 
 
 def _tops(points: Tensor, corner: Tensor) -> np.ndarray:

@@ -210,3 +210,17 @@ class Lifted(AutogradField):
 
     def distance(self, points):
         return self.field.distance(points + torch.tensor([0.0, 0.0, 0.7]))
+
+
+def test_a_thing_is_taken_where_it_is_heavy() -> None:
+    """A hammer's head holds most of its volume; a hand at the end of the handle would let it turn."""
+    head, handle = Box((0.12, 0.0, 0.72), (0.03, 0.035, 0.02)), Box((-0.03, 0.0, 0.71), (0.13, 0.01, 0.01))
+    field = Union(TABLE, head, handle)
+    eyes = torch.tensor([[0.0, -0.5, 1.3], [0.0, 0.5, 1.3], [0.5, 0.0, 1.3], [-0.5, 0.0, 1.3]])
+    surface = object_surface(field, torch.tensor([-0.02, 0.0, 0.72]), eyes)
+    assert surface is not None
+    volumes = torch.tensor([0.06 * 0.07 * 0.04, 0.26 * 0.02 * 0.02])
+    middle = (volumes * torch.tensor([0.12, -0.03])).sum() / volumes.sum()
+    assert float(surface.middle[0]) == pytest.approx(float(middle), abs=0.02)
+    best = find_grasps(field, surface, HAND).T_world_tool[:3, 0, 3]
+    assert (best - middle).abs().max() < 0.06
