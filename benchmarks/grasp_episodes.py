@@ -93,13 +93,14 @@ class GraspTaskOf:
             "reason": grasping.reason,
             "lifted": ended == "success",
             "lift_height": grasping.lift_height,
+            "tries": grasping.tries,
             "contacts": contacts,
             "drive": dataclasses.asdict(drive) | {"status": drive.status.value},
             "planning_seconds": grasping.planning_seconds,
             "robot_seconds": grasping.episode.robot.time,
         }
         grasping.episode.close()
-        again = unwanted(recheck(self.the_scene(), folder / "states.npz"))
+        again = unwanted(recheck(self.the_scene(), folder / "states.npz", watched="target"))
         return report | {
             "success": ended == "success" and not contacts and not again,
             "contacts_rechecked": again,
@@ -108,9 +109,13 @@ class GraspTaskOf:
 
 
 def unwanted(touched: dict[str, float]) -> dict[str, float]:
-    """The contacts but for those of the hand with what it takes."""
+    """The contacts but for those of what is taken with the hand and with the parts of what it stands on."""
     wanted = {f"{link} - target" for link in HAND}
-    return {pair: depth for pair, depth in touched.items() if pair not in wanted}
+    return {
+        pair: depth
+        for pair, depth in touched.items()
+        if pair not in wanted and not pair.startswith("target - support.")
+    }
 
 
 def lost_at(report: dict) -> str:

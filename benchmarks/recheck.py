@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +20,14 @@ AWAY = planar_pose(0.0, 0.0, 50.0)
 """Where a solid waits that is not in the world yet."""
 
 
-def recheck(scene: Scene, states: Path, every: int = 1) -> dict[str, float]:
+def recheck(scene: Scene, states: Path, every: int = 1, watched: str | None = None) -> dict[str, float]:
     """Deepest overlap [m] of each pair "link - body" over the recorded states.
 
     Args:
         scene: the one that the episode ran in.
         states: its states.npz.
         every: looks at one state in so many.
+        watched: name of a solid whose overlaps with other bodies count as well, as "watched - body".
     """
     with np.load(states) as saved:
         data = {key: saved[key] for key in saved.files}
@@ -44,17 +46,23 @@ def recheck(scene: Scene, states: Path, every: int = 1) -> dict[str, float]:
             for name, pose in zip(names, data["object_poses"][index], strict=True):
                 world.set_object_pose(name, AWAY if np.isnan(pose).any() else pose)
             pybullet.performCollisionDetection(physicsClientId=world.client)
-            for pair, depth in _overlaps(world).items():
+            found = _overlaps(world, world.robot.body, world.robot.link_names)
+            if watched is not None:
+                body = world.body_id(watched)
+                found |= _overlaps(world, body, {-1: watched}, other_than=world.robot.body)
+            for pair, depth in found.items():
                 deepest[pair] = max(deepest.get(pair, 0.0), depth)
     return deepest
 
 
-def _overlaps(world: World) -> dict[str, float]:
+def _overlaps(
+    world: World, body: int, names: Mapping[int, str], other_than: int | None = None
+) -> dict[str, float]:
+    """Of a body, whose links have names, with all bodies but itself and perhaps another."""
     found: dict[str, float] = {}
-    client, robot = world.client, world.robot
-    for point in pybullet.getContactPoints(bodyA=robot.body, physicsClientId=client):
-        if point[2] == robot.body or -point[8] <= TOUCH:
+    for point in pybullet.getContactPoints(bodyA=body, physicsClientId=world.client):
+        if point[2] in (body, other_than) or -point[8] <= TOUCH:
             continue
-        pair = f"{robot.link_names[point[3]]} - {world.name_of(point[2], point[4])}"
+        pair = f"{names[point[3]]} - {world.name_of(point[2], point[4])}"
         found[pair] = max(found.get(pair, 0.0), float(-point[8]))
     return found

@@ -12,7 +12,8 @@ from torch import Tensor
 import planning
 import robots
 from examples.disturbances import DisturbedRobot
-from planning.grasping import GraspConfig, Grasps, ParallelHand
+from planning.grasping import GraspConfig, Grasps
+from planning.hand_room import ParallelHand
 from planning.protocols import DistanceField
 from planning.workspace import Workspace
 from robots.fine_cover import fine_cover
@@ -24,8 +25,10 @@ CONTROL_PERIOD = 0.02
 # The share of the URDF's speed limits the arm uses, and its accelerations [rad/s^2 | m/s^2].
 SPEED_SHARE, ACCELERATION = 0.4, 1.0
 HAND = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
-ARM_ROOM = 0.005
-"""Of arm and torso on the straight lines [m]; the hand's is judged in the finer map."""
+MOVED = 0.001
+"""Balls of the robot that move less than this [m] stand where they stood before."""
+ARM_ROOM = 0.015
+"""Of what moves of arm and torso on the straight lines [m]; the hand's is judged in the finer map."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,11 @@ def reachable_grasps(
             above = tools[i].clone()
             above[2, 3] += rise
             lift = straight_line(model, approach[-1], tools[i], above)
-            if lift is None or clearance(model, torch.cat([approach, lift]), field, arm) < ARM_ROOM:
+            if lift is None:
+                continue
+            ways = torch.cat([approach, lift])
+            moved = (model.spheres(ways)[0] - model.spheres(q)[0]).norm(dim=-1).amax(dim=0) > MOVED
+            if clearance(model, ways, field, arm & moved) < ARM_ROOM:
                 continue
             if clearance(model, ends.q[i : i + 1], field) > 0:
                 yield Grasp(approach, lift)

@@ -22,7 +22,7 @@ if not __package__:  # run as a file
 
 import isdf
 from examples.episode import Episode, EpisodeOptions, chosen_scene
-from examples.grasp_stages import LIFTED, choose_grasp, close_look, take
+from examples.grasp_stages import LIFTED, CloseLook, choose_grasp, take
 from examples.pointing import click_on
 
 
@@ -48,15 +48,18 @@ def main(options: LiftObject) -> float:
     point = click_on(episode.world, task.object_name, np.array([*task.park[:2], 1.2]), options.seed)
     point = episode.live.moved_goal(point)  # with --viewer it can be dragged
     episode.live.say("looking closely")
-    close = close_look(episode, point, options.looks, episode.clock())
+    close = CloseLook(episode, point, episode.clock())
+    close.look(options.looks)
     options.out.mkdir(parents=True, exist_ok=True)
     around = torch.as_tensor(np.stack([point - 0.2, point + 0.2]), dtype=torch.float32)
-    isdf.plot_slice(close, float(point[2]), bounds=around, spacing=0.004).savefig(options.out / "slice.png")
+    isdf.plot_slice(close.mapper.field(), float(point[2]), bounds=around, spacing=0.004).savefig(
+        options.out / "slice.png"
+    )
 
-    point = episode.live.moved_goal(point)
-    episode.live.look_closely(close, point)
+    point = close.point = episode.live.moved_goal(point)
+    episode.live.look_closely(close.mapper.field(), point)
     episode.live.say("choosing a grasp")
-    chosen = choose_grasp(episode, close, point, options.margin, options.seed)
+    chosen = choose_grasp(episode, close, options.margin, options.seed)
     if isinstance(chosen, str):
         print(chosen)
         return 0.0

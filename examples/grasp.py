@@ -28,7 +28,17 @@ if not __package__:  # run as a file
 
 from examples.arm import Grasp, parked
 from examples.episode import Episode, EpisodeOptions, chosen_scene
-from examples.grasp_stages import HELD_FOR, LIFTED, choose_grasp, close_look, take
+from examples.grasp_stages import (
+    HELD_FOR,
+    LIFT,
+    LIFTED,
+    CloseLook,
+    choose_grasp,
+    draw_back,
+    holds_nothing,
+    raise_torso,
+    take,
+)
 from examples.parking import parking_places
 from examples.pictures import Film, save_map_picture
 from examples.pointing import click_on
@@ -39,6 +49,8 @@ from planning.protocols import DistanceField
 from planning.replanning import ReplanningConfig, ReplanningLoop
 from robots.simulation import DepthFrame, GraspTask, Scene, SceneField
 
+TRIES = 3
+"""So often the robot grasps at most."""
 PLACES = 3
 """The robot tries at most so many places to park."""
 
@@ -85,7 +97,9 @@ class GraspEpisode:
         self.reason = ""
         self.planning_seconds = 0.0
         self.lift_height = 0.0
+        self.tries = 0
         self.film = Film(self.episode, self.point, 0.7 if options.film else np.inf)
+        self.close = CloseLook(self.episode, self.point, self.clock, self.film.add)
         self.bar = tqdm(desc="looking around", unit=" s", disable=None, bar_format="{desc}: {elapsed}")
 
     def run(self) -> str:
@@ -98,23 +112,42 @@ class GraspEpisode:
                 assert self.drive is not None
                 self.reason = self.drive.message
                 continue
+            ended = self.grasp_from_here()
+            if ended != "planning":
+                break
+        return ended
+
+    def grasp_from_here(self) -> str:
+        """Look, reach and lift, and again if the hand comes up empty: "success", or the stage that failed."""
+        robot, name = self.episode.robot, self.task.object_name
+        tucked, ended = robot.posture(), "planning"
+        for _ in range(TRIES):
             self.bar.set_description("looking closely and planning the reach")
             chosen = self.plan()
             if isinstance(chosen, str):
-                ended, self.reason = "planning", chosen
-                continue
+                self.reason = chosen if ended == "planning" else f"{self.reason}, then {chosen}"
+                return ended
             self.bar.set_description("grasping")
             self.chosen = chosen[0]
             self.film.tool_way = self.tool_way()
             self.film.close_map = None if self.looked is None else self.looked[0]
-            self.episode.robot.disturbances.append(self.film)
+            if self.film not in self.episode.robot.disturbances:
+                self.episode.robot.disturbances.append(self.film)
             self.film.close_up = self.point
             self.episode.live.reach([chosen[1], chosen[0].approach, chosen[0].lift])
             self.episode.live.say("grasping")
-            name = self.task.object_name
+            self.tries += 1
             self.lift_height = take(self.episode, *chosen, name, self.film.add)
-            self.reason = ""
-            return "success" if self.lift_height >= LIFTED else "lift"
+            ended, self.reason = "lift", "slipped out of the hand"
+            if self.lift_height >= LIFTED:
+                self.reason = ""
+                return "success"
+            if not holds_nothing(self.episode):
+                self.reason = "held, but not high enough"
+                return ended
+            if not draw_back(self.episode, tucked, self.options.margin, self.options.seed):
+                return ended
+            self.close = CloseLook(self.episode, self.point, self.clock, self.film.add)  # it may have moved
         return ended
 
     def places(self) -> Iterator[tuple[float, float, float]]:
@@ -159,18 +192,22 @@ class GraspEpisode:
     def plan(self) -> tuple[Grasp, torch.Tensor] | str:
         """Look closely, then choose a grasp and the way to it; or say why there is none."""
         options, robot, live = self.options, self.episode.robot, self.episode.live
+        tucked = float(robot.posture()[self.episode.model.joint_names.index(LIFT)])
         live.say("looking closely")
-        close = close_look(self.episode, self.point, options.looks, self.clock, self.film.add)
+        self.close.look(options.looks)
+        field = self.close.mapper.field()
         if live.last_frame is not None:
-            self.looked = close, live.last_frame
-        self.point = live.moved_goal(self.point)  # somebody may have dragged it
-        live.look_closely(close, self.point)
+            self.looked = field, live.last_frame
+        self.point = self.close.point = live.moved_goal(self.point)  # somebody may have dragged it
+        live.look_closely(field, self.point)
         live.say("choosing a grasp")
         found, spent = self.clock.charge(
-            lambda: choose_grasp(self.episode, close, self.point, options.margin, options.seed)
+            lambda: choose_grasp(self.episode, self.close, options.margin, options.seed)
         )
         self.planning_seconds += spent
         robot.wait(spent)
+        if isinstance(found, str):
+            raise_torso(self.episode, tucked)
         return found
 
     def tool_way(self) -> np.ndarray | None:
@@ -220,6 +257,7 @@ def main(options: GraspOptions) -> dict:
         "ended": ended,
         "reason": grasping.reason,
         "lift_height": grasping.lift_height,
+        "tries": grasping.tries,
         "held_seconds": HELD_FOR if ended == "success" else 0.0,
         "contacts": len(contacts),
         "contact_pairs": contacts,

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 import isdf
-from examples.arm import Grasp, execute, open_hand, parked, plan_reach, reachable_grasps, within_limits
+from examples.arm import (
+    Grasp,
+    clearance,
+    execute,
+    open_hand,
+    parked,
+    plan_reach,
+    reachable_grasps,
+    within_limits,
+)
 from examples.episode import Episode
 from isdf.field import grid_points
 from planning.clock import Clock
@@ -19,14 +30,23 @@ from planning.object_surface import object_surface
 from planning.protocols import DistanceField
 from robots.simulation import DepthFrame
 
+LIFT = "torso_lift_joint"
 GRIP_FORCE = 30.0
 """[N]"""
+MET = 0.002
+"""Fingers with less than this between them [m] have met."""
 LIFTED, HELD_FOR = 0.10, 2.0
 """What counts as lifted [m], and for how long it is held [s]."""
-CLOSE = isdf.MapperConfig(voxel=0.01, truncation=0.031)
-"""The map of the object alone: fingers need it finer than wheels do."""
-NEAR = 0.8
+CLOSE = isdf.MapperConfig(voxel=0.008, truncation=0.031, refresh_period=math.inf, guess_period=math.inf)
+"""The map of the object alone: fingers need it finer than wheels do. It is read once, after all images."""
+NEAR = 0.45
 """What is farther from the object than this [m] is left out of its map."""
+HEIGHTS = 3
+"""The torso rises so many times: from higher up more of the far sides is seen."""
+GLANCES = ((0.0, 0.0), (0.12, -0.08), (-0.12, -0.08), (0.0, 0.1))
+"""Where the camera looks in turn, sideways and up from the point [m]."""
+APART = 0.05
+"""Places nearer to each other than this [m] see the same."""
 SPACING = 0.03
 """Of the baked map that the arm plans in [m]."""
 AROUND = 0.03
@@ -35,31 +55,81 @@ PLANS = 4
 """So many of the best grasps are planned to."""
 
 
-def close_look(
-    episode: Episode, point: np.ndarray, looks: int, clock: Clock, watch: Callable[[], None] = lambda: None
-) -> DistanceField:
-    """A fine map round a point [m], from images of a head that moves a little between them.
+class CloseLook:
+    """A fine map round a point, and where its images were taken from; it grows with every place the robot looks from.
 
-    The images go into the episode's map, too, and before them some of the space that the arm will move through.
+    Args:
+        episode: whose own map takes in the images, too.
+        point: on the object [m].
+        clock: what computing costs.
+        watch: called after every image.
     """
-    mapper = isdf.Mapper(CLOSE)
-    x, y, yaw = episode.robot.base_state()
-    side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-    middle = (point + np.array([x, y, 0.3])) / 2
-    before = [middle, *(shift * side + at for shift in (0.6, -0.6) for at in (middle, point))]
-    for number in range(len(before) + looks):
-        close = point + (0.0, 0.15, -0.15)[number % 3] * side
-        episode.robot.look_at(before[number] if number < len(before) else close)
-        episode.robot.wait(0.3)
-        frame = episode.robot.observe()
+
+    def __init__(
+        self, episode: Episode, point: np.ndarray, clock: Clock, watch: Callable[[], None] = lambda: None
+    ) -> None:
+        self.episode, self.point, self.clock, self.watch = episode, point, clock, watch
+        self.mapper = isdf.Mapper(CLOSE)
+        self._eyes: list[np.ndarray] = []
+
+    @property
+    def eyes(self) -> Float[torch.Tensor, "k 3"]:
+        """Places of the camera [m] that saw the object, but for those that hardly differ."""
+        return torch.as_tensor(np.array(self._eyes).reshape(-1, 3), dtype=torch.float32)
+
+    def look(self, looks: int) -> None:
+        """Take images, first of the space that the arm will move through, then of the object while the torso rises."""
+        x, y, yaw = self.episode.robot.base_state()
+        side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        middle = (self.point + np.array([x, y, 0.3])) / 2
+        for at in (middle, *(shift * side + at for shift in (0.6, -0.6) for at in (middle, self.point))):
+            self._take(at)
+        for number, height in enumerate(heights_to_look_from(self.episode)):
+            if number:
+                raise_torso(self.episode, height)
+            for glance in range(-(-looks // HEIGHTS)):
+                beside, above = GLANCES[glance % len(GLANCES)]
+                self._take(self.point + beside * side + (0.0, 0.0, above))
+        self.mapper.refresh()
+
+    def _take(self, at: np.ndarray) -> None:
+        """An image of what is at a place [m]."""
+        robot, mapper = self.episode.robot, self.episode.mapper
+        robot.look_at(at)
+        robot.wait(0.3)
+        frame = robot.observe()
         if frame is None or not frame.depth.any():
-            continue
-        near = only_near(frame, point)
-        views = [(episode.mapper, frame), *([(mapper, near)] if near.depth.any() else [])]
-        spent = sum(clock.charge(partial(taking.integrate, view))[1] for taking, view in views)
-        episode.robot.wait(spent + clock.train(episode.mapper))
-        watch()
-    return mapper.field()
+            return
+        near = only_near(frame, self.point)
+        views = [(mapper, frame), *([(self.mapper, near)] if near.depth.any() else [])]
+        spent = sum(self.clock.charge(partial(taking.integrate, view))[1] for taking, view in views)
+        eye = frame.T_world_camera[:3, 3]
+        if len(views) > 1 and all(np.linalg.norm(eye - other) > APART for other in self._eyes):
+            self._eyes.append(eye)
+        robot.wait(spent + self.clock.train(mapper))
+        self.watch()
+
+
+def heights_to_look_from(episode: Episode) -> list[float]:
+    """Positions of the torso [m], from where it is upwards as far as the robot keeps clear in its map."""
+    model, q = parked(episode.model, episode.robot.posture())
+    lift = model.joint_names.index(LIFT)
+    postures = q.repeat(8, 1)
+    postures[:, lift] = torch.linspace(float(q[lift]), float(model.joint_limits[lift, 1]), 8)
+    field, free = episode.mapper.field(), 1
+    room = min(AROUND, clearance(model, postures[:1], field))
+    while free < len(postures) and clearance(model, postures[free : free + 1], field) >= room:
+        free += 1
+    return torch.linspace(float(q[lift]), float(postures[free - 1, lift]), HEIGHTS).tolist()
+
+
+def raise_torso(episode: Episode, height: float) -> None:
+    """Move the torso to a position [m], the arm as it is."""
+    model, q = parked(episode.model, episode.robot.posture())
+    q = within_limits(model, q)
+    goal = q.clone()
+    goal[model.joint_names.index(LIFT)] = height
+    execute(episode.robot, model, torch.stack([q, within_limits(model, goal)]))
 
 
 def only_near(frame: DepthFrame, point: np.ndarray) -> DepthFrame:
@@ -72,25 +142,25 @@ def only_near(frame: DepthFrame, point: np.ndarray) -> DepthFrame:
 
 
 def choose_grasp(
-    episode: Episode, close: DistanceField, point: np.ndarray, margin: float, seed: int
+    episode: Episode, close: CloseLook, margin: float, seed: int
 ) -> tuple[Grasp, torch.Tensor] | str:
     """The best grasp that the arm can get to, and the way there (n, dof); or why there is none.
 
     Args:
         episode: with its robot parked.
-        close: the fine map.
-        point: on the object [m].
+        close: what was seen of the object.
         margin: clearance the arm keeps in the map where start and goal allow it [m].
         seed: of all that is random.
     """
     model, q = parked(episode.model, episode.robot.posture())
     q = within_limits(model, q)
     x, y, _ = episode.robot.base_state()
-    heading = float(np.arctan2(point[1] - y, point[0] - x))
-    surface = object_surface(close, torch.as_tensor(point, dtype=torch.float32), seed=seed)
+    point, map_of_it = torch.as_tensor(close.point, dtype=torch.float32), close.mapper.field()
+    heading = float(torch.atan2(point[1] - y, point[0] - x))
+    surface = object_surface(map_of_it, point, close.eyes, seed=seed)
     if surface is None:
         return "nothing stands at the point"
-    grasps = find_grasps(close, surface, open_hand(model), heading, seed=seed)
+    grasps = find_grasps(map_of_it, surface, open_hand(model), heading, seed=seed)
     if len(grasps) == 0:
         return "no antipodal grasp with room for the hand"
     field = field_for_reaching(episode)
@@ -123,7 +193,7 @@ def own_space(episode: Episode) -> tuple[torch.Tensor, torch.Tensor]:
     """Balls (n, 3), (n,) [m] in which the robot is, or will be when its torso rises: its camera never sees them."""
     model = episode.model
     q = torch.as_tensor(episode.robot.posture(), dtype=torch.float32).repeat(5, 1)
-    lift = model.joint_names.index("torso_lift_joint")
+    lift = model.joint_names.index(LIFT)
     q[1:, lift] = torch.linspace(float(q[0, lift]), float(model.joint_limits[lift, 1]), 4)
     centres, radii = model.spheres(q)
     rising = torch.tensor([link.startswith("torso") for link in model.sphere_links])
@@ -156,3 +226,28 @@ def take(
         heights.append(robot.world.object_pose(object_name)[2, 3] - before)
         watch()
     return float(min(heights))
+
+
+def holds_nothing(episode: Episode) -> bool:
+    """Whether the fingers have met; this the robot feels itself."""
+    gripper = episode.model.gripper
+    assert gripper is not None
+    gaps = [
+        episode.robot.world.robot.joint_position(name) - closed
+        for name, closed in zip(gripper.joint_names, gripper.closed_position, strict=True)
+    ]
+    return sum(gaps) < MET
+
+
+def draw_back(episode: Episode, tucked: np.ndarray, margin: float, seed: int) -> bool:
+    """Open the empty hand and move the arm back to where it was, posture (dof,), through the map."""
+    robot = episode.robot
+    robot.world.command_gripper(1.0)
+    robot.wait(1.0)
+    model, q = parked(episode.model, robot.posture())
+    _, goal = parked(episode.model, tucked)
+    q, goal = within_limits(model, q), within_limits(model, goal)
+    result = plan_reach(model, q, goal, field_for_reaching(episode), margin, seed)
+    if result.success:
+        execute(robot, model, result.trajectory.waypoints)
+    return result.success

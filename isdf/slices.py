@@ -18,6 +18,8 @@ from .slice_geometry import corners, slice_basis
 
 # Of the same order as the distance at which planners stop caring; farther away all blues look the same.
 COLOUR_LIMIT = 1.5
+# In a small region the colours end at this share of its longer side.
+COLOUR_SHARE = 0.25
 # Picture elements along the longer side of a slice in a notebook.
 ELEMENTS = 250
 
@@ -78,6 +80,7 @@ def draw_slice(
     )
     points = torch.from_numpy(grid.astype(np.float32))
     distance = field.distance(points).cpu().numpy()
+    limit = min(COLOUR_LIMIT, COLOUR_SHARE * float(np.ptp(box, axis=0)[:2].max()))
     if grey_unknown and hasattr(field, "confidence"):
         distance = np.where(field.confidence(points).cpu().numpy() >= 0.5, distance, np.nan)
     image = axes.imshow(
@@ -85,8 +88,8 @@ def draw_slice(
         origin="lower",
         extent=(x0, x1, y0, y1),
         cmap="coolwarm_r",
-        vmin=-COLOUR_LIMIT,
-        vmax=COLOUR_LIMIT,
+        vmin=-limit,
+        vmax=limit,
     )
     axes.set_facecolor("0.75")
     axes.contour(xs, ys, distance, levels=[0.0], colors="black", linewidths=1.2)

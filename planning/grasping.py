@@ -7,41 +7,30 @@ force-closure grasps", IJRR 1988); the fingers come level, from above, or from a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from planning.errors import ConfigError
+from planning.hand_room import ParallelHand, RoomRound
 from planning.object_surface import ObjectSurface
-from planning.protocols import ConfidentField, DistanceField
+from planning.protocols import DistanceField
 from planning.threads import one_thread
-
-
-@dataclass(frozen=True, eq=False)
-class ParallelHand:
-    """An open hand in its tool frame: z along the fingers, y from one finger to the other, the origin between the tips.
-
-    Args:
-        centres: (s, 3) of balls that cover hand and fingers [m].
-        radii: (s,) [m].
-        opening: between the fingers [m].
-        tips: how far the fingers reach beyond the origin [m].
-    """
-
-    centres: Float[Tensor, "s 3"]
-    radii: Float[Tensor, " s"]
-    opening: float
-    tips: float
-
 
 POINTS = 1200
 """Of a surface are looked at; more cost time and tell no more."""
-FINGER = 0.04
-"""What lies this near to the tips is a finger [m]."""
 FACE = 0.004
 """What lies within this of a grasp's widest place is the face that a finger closes on [m]."""
+OUTLIERS = 2
+"""So many points on either side of a grasp may stick out, and are noise."""
+SHALLOW = 0.006
+"""Fingers that reach less far over an object [m] hold nothing."""
+LEVER = 8.0
+"""What a grasp's score loses for each metre that it is away from the middle."""
+UNSEEN = 1.5
+"""What a grasp's score loses if a finger is in unseen space altogether."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +45,12 @@ class GraspConfig:
         pad: width of a finger's face [m].
         play: least difference between opening and object [m].
         antipodal: least mean cosine between a face's normals and the closing line.
-        hold: least share of a finger's pad that touches the object.
+        square: the same for the face's mean normal seen along the fingers: a finger can lie against a face that slopes
+            a little, and maps round the edges of what is flat, but a face that is turned pushes the thing away.
+        hold: least share of a finger's pad, as far as it reaches over the object, that touches it.
+        above: the fingers stay so far over the support [m], by what the map and the arm may be wrong.
         room: least clearance of the open hand [m]; negative by what the map and the balls may be wrong.
-        confidence: where the field knows how sure it is, fingers stay out of space below this: unknown is not free.
+        seen: least share of each finger that is in space that was seen: unknown is not free.
         retreat: the hand needs room along its way from this far before the grasp, too [m].
         most: grasps to return.
     """
@@ -66,13 +58,15 @@ class GraspConfig:
     headings: int = 36
     pitches: tuple[float, ...] = (0.0, 0.3, 0.7, 1.1, math.pi / 2)
     anchors: int = 48
-    bites: tuple[float, ...] = (0.02, 0.035, 0.05)
+    bites: tuple[float, ...] = (0.012, 0.02, 0.035, 0.05)
     pad: float = 0.02
     play: float = 0.006
-    antipodal: float = 0.85
+    antipodal: float = 0.7
+    square: float = 0.92
     hold: float = 0.5
+    above: float = 0.004
     room: float = -0.003
-    confidence: float = 0.65
+    seen: float = 0.3
     retreat: float = 0.12
     most: int = 40
 
@@ -131,23 +125,23 @@ def find_grasps(
     config = config or GraspConfig()
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randperm(len(surface.points), generator=generator)[:POINTS]
-    surface = ObjectSurface(surface.points[drawn], surface.normals[drawn], surface.support)
+    surface = replace(surface, points=surface.points[drawn], normals=surface.normals[drawn])
     anchors = surface.points[: config.anchors]
     found = [
         _along(surface, anchors, turn, hand, bite, config)
         for turn in _turns(config, _yaw(surface))
         for bite in config.bites
     ]
-    T, width, antipodal, hold = (torch.cat(parts) for parts in zip(*found, strict=True))
+    T, width, antipodal, hold, depth = (torch.cat(parts) for parts in zip(*found, strict=True))
     grasps = Grasps(
         T,
         width,
         antipodal,
         torch.zeros_like(width),
-        _score(T, width, antipodal, surface, hand, heading) + 2.0 * hold,
+        _score(T, width, antipodal, surface, hand, heading) + 3.0 * hold * depth,
     )
     good = (width <= hand.opening - config.play) & (antipodal >= config.antipodal) & (hold >= config.hold)
-    return _with_room(field, grasps.take(good), hand, config)
+    return _with_room(RoomRound(field, surface), grasps.take(good), hand, config)
 
 
 def _yaw(surface: ObjectSurface) -> float:
@@ -180,32 +174,59 @@ def _along(
     hand: ParallelHand,
     bite: float,
     config: GraspConfig,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Poses (k, 4, 4), widths, cosines and holds (k,) of grasps with one rotation, at every anchor.
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Poses (k, 4, 4), widths, cosines, holds and depths (k,) of grasps with one rotation, at every anchor.
 
-    A hold is how much of a pad touches the face, by length and width, on the side that has less: at most 1.
+    A hold is how much of a pad touches the face, by length and width, on the side that has less: at most 1; a
+    depth is how much of a pad reaches over the object. Fingers reach less far where they would come too near to its
+    support.
     """
     local, normals = surface.points @ turn, surface.normals @ turn
     here = anchors @ turn
     slab = (local[None, :, 0] - here[:, None, 0]).abs() <= config.pad / 2
     slab &= (local[None, :, 1] - here[:, None, 1]).abs() <= hand.opening
     front = local[:, 2].expand(slab.shape).masked_fill(~slab, torch.inf).amin(dim=1)
-    window = slab & (local[None, :, 2] <= front[:, None] + bite + 0.01)
+    deep = front + _bite(here[:, 0], front, turn, surface.support + config.above, hand, bite)
+    window = slab & (local[None, :, 2] <= deep[:, None] + 0.01)
     across = local[:, 1].expand(slab.shape)
-    low = across.masked_fill(~window, torch.inf).amin(dim=1)
-    high = across.masked_fill(~window, -torch.inf).amax(dim=1)
-    cosines, holds = [], []
+    low = _outermost(across, window)
+    high = -_outermost(-across, window)
+    length = (deep - front).clamp(SHALLOW, config.pad)
+    cosines, squares, holds = [], [], []
     for facing, near in (
         (normals[:, 1], across >= high[:, None] - FACE),
         (-normals[:, 1], across <= low[:, None] + FACE),
     ):
-        face = window & near & (local[None, :, 2] >= front[:, None] + bite - config.pad)
-        cosines.append(_mean(facing.expand(slab.shape), face))
-        holds.append(_extent(local[:, 2], face, config.pad) * _extent(local[:, 0], face, config.pad))
-    origin = torch.stack([here[:, 0], (low + high) / 2, front + bite - hand.tips], dim=1)
+        face = window & near & (local[None, :, 2] >= deep[:, None] - config.pad)
+        mean = _mean(facing.expand(slab.shape), face)
+        cosines.append(mean)
+        squares.append(mean / mean.hypot(_mean(normals[:, 0].expand(slab.shape), face)).clamp_min(1e-6))
+        holds.append(
+            _extent(local[:, 2], face) / length * (_extent(local[:, 0], face) / config.pad).clamp_max(1.0)
+        )
+    origin = torch.stack([here[:, 0], (low + high) / 2, deep - hand.tips], dim=1)
     T = torch.eye(4).repeat(len(anchors), 1, 1)
     T[:, :3, :3], T[:, :3, 3] = turn, origin @ turn.T
-    return T, high - low, torch.minimum(*cosines), torch.minimum(*holds)
+    fits = (deep - front >= SHALLOW) & (torch.minimum(*squares) >= config.square)
+    hold = torch.minimum(*holds).clamp_max(1.0).where(fits, 0.0)
+    return T, high - low, torch.minimum(*cosines), hold, length / config.pad
+
+
+def _bite(
+    across: Tensor, front: Tensor, turn: Tensor, floor: float, hand: ParallelHand, bite: float
+) -> Float[Tensor, " k"]:
+    """How deep the fingers reach over an object from its front (k,) [m] to end above a height `floor` [m]."""
+    down = -float(turn[2, 2])
+    if down < 0.2:  # level fingers come no higher by reaching less far
+        return torch.full_like(front, bite)
+    lowest = float(((hand.centres @ turn.T)[:, 2] - hand.radii).min())
+    tool = turn[2, 0] * across + turn[2, 2] * (front + bite - hand.tips)
+    return bite - (floor - (tool + lowest)).clamp_min(0.0) / down
+
+
+def _outermost(values: Tensor, mask: Tensor) -> Float[Tensor, " k"]:
+    """The least of each row's values where the mask is set, but for a few that may be wrong."""
+    return values.masked_fill(~mask, torch.inf).topk(OUTLIERS + 1, dim=1, largest=False).values[:, -1]
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -215,61 +236,35 @@ def _mean(values: Tensor, mask: Tensor) -> Tensor:
     return mean.where(count > 0, -1.0)
 
 
-def _extent(values: Tensor, mask: Tensor, most: float) -> Tensor:
-    """Range of the values (n,) where each row's mask is set, as a share of `most`, at most 1."""
+def _extent(values: Tensor, mask: Tensor) -> Tensor:
+    """Range of the values (n,) where each row's mask is set, 0 where it is not at all."""
     rows = values.expand(mask.shape)
     extent = rows.masked_fill(~mask, -torch.inf).amax(dim=1) - rows.masked_fill(~mask, torch.inf).amin(dim=1)
-    return (extent / most).clamp(0.0, 1.0)
+    return extent.clamp_min(0.0)
 
 
 def _score(
     T: Tensor, width: Tensor, antipodal: Tensor, surface: ObjectSurface, hand: ParallelHand, heading: float
 ) -> Float[Tensor, " n"]:
-    """Opposite faces count most, then being near the middle, play for the fingers, and the robot's side."""
-    low, high = surface.points.amin(dim=0), surface.points.amax(dim=0)
-    middle = (low + high) / 2
-    away = (T[:, :3, 3] - middle) / (high - low).norm()
-    beside = away[:, :2].norm(dim=1) + 0.5 * away[:, 2].abs()
+    """Opposite faces count, being near the middle, where weight does not turn the thing in the hand, play for the
+    fingers, and the robot's side.
+    """
+    away = T[:, :3, 3] - surface.middle
+    beside = away[:, :2].norm(dim=1) + 0.3 * away[:, 2].abs()
     tight = (width / hand.opening - 0.75).clamp_min(0.0)
     towards = T[:, 0, 2] * math.cos(heading) + T[:, 1, 2] * math.sin(heading)
-    return 3.0 * antipodal - 0.8 * beside - 0.5 * tight + 0.3 * towards
+    return 5.0 * antipodal - LEVER * beside - 0.5 * tight + 0.3 * towards
 
 
-def _with_room(field: DistanceField, grasps: Grasps, hand: ParallelHand, config: GraspConfig) -> Grasps:
+def _with_room(room: RoomRound, grasps: Grasps, hand: ParallelHand, config: GraspConfig) -> Grasps:
     """The best of those whose open hand is clear at the grasp and on the straight way to it; no two nearly alike."""
-    order = grasps.score.argsort(descending=True)[: 40 * config.most]
-    grasps = grasps.take(order)
-    clearance = hand_clearance(field, grasps.T_world_tool, hand, config.retreat)
-    grasps = Grasps(grasps.T_world_tool, grasps.width, grasps.antipodal, clearance, grasps.score)
-    grasps = grasps.take((clearance >= config.room) & _seen(field, grasps.T_world_tool, hand, config))
+    grasps = grasps.take(grasps.score.argsort(descending=True)[: 40 * config.most])
+    seen = room.seen_share(grasps.T_world_tool, hand)
+    grasps = replace(grasps, score=grasps.score - UNSEEN * (1 - seen)).take(seen >= config.seen)
+    grasps = grasps.take(grasps.score.argsort(descending=True))
+    clearance = room.clearance(grasps.T_world_tool, hand, config.retreat)
+    grasps = replace(grasps, clearance=clearance).take(clearance >= config.room)
     return grasps.take(_different(grasps.T_world_tool, config.most))
-
-
-def hand_clearance(
-    field: DistanceField, T_world_tool: Float[Tensor, "n 4 4"], hand: ParallelHand, retreat: float
-) -> Float[Tensor, " n"]:
-    """Least clearance [m] of an open hand at poses and on the straight ways to them, `retreat` [m] long."""
-    clearance = torch.full((len(T_world_tool),), torch.inf)
-    for back in torch.linspace(0.0, retreat, 4).tolist():
-        local = hand.centres - torch.tensor([0.0, 0.0, back])
-        for block in torch.arange(len(T_world_tool)).split(256):
-            T = T_world_tool[block]
-            centres = local @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]
-            gaps = (field.distance(centres) - hand.radii).amin(dim=1)
-            clearance[block] = torch.minimum(clearance[block], gaps)
-    return clearance
-
-
-def _seen(
-    field: DistanceField, T: Float[Tensor, "n 4 4"], hand: ParallelHand, config: GraspConfig
-) -> Bool[Tensor, " n"]:
-    """Where both fingers are in seen space: behind an object may be more of it. All, if the field cannot tell."""
-    if not isinstance(field, ConfidentField):
-        return torch.ones(len(T), dtype=torch.bool)
-    fingers = hand.centres[hand.centres[:, 2] > -FINGER]
-    known = field.confidence(fingers @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]) >= config.confidence
-    sides = [known[:, side].float().mean(dim=1) for side in (fingers[:, 1] > 0, fingers[:, 1] < 0)]
-    return torch.minimum(*sides) > 0.75
 
 
 def _different(T: Float[Tensor, "n 4 4"], most: int) -> Bool[Tensor, " n"]:

@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import robots
 from benchmarks import grasp_episodes
 from benchmarks.episodes import run_missing
 from benchmarks.grasp_scenes import SUPPORTS, grasp_scene, shapes, thing_named, things
+from benchmarks.recheck import recheck
 from robots.simulation import World
+from robots.simulation.recording import Recording
 
 
 @pytest.mark.parametrize("support", SUPPORTS)
@@ -75,3 +78,27 @@ def test_results_say_which_thing_and_which_stage_lost(tmp_path: Path, monkeypatc
     with pytest.raises(SystemExit, match=r"of another episode: its .*seed.* differ; choose another --out"):
         run_missing(dataclasses.replace(options, seed=1))
     capsys.readouterr()
+
+
+def test_what_is_taken_may_touch_its_support_and_the_hand_only(tmp_path: Path) -> None:
+    """The states of a thing that stands, and of one that is pushed into its neighbour."""
+    scene = grasp_scene("flat", 3, "table", thing_named("carton"))
+    model = robots.load("tiago")
+    q = model.named["tucked"].double().numpy().copy()
+    q[:3] = scene.grasp.park
+    for name, pushed in (("standing", False), ("pushed", True)):
+        with World(scene) as world:
+            robot = world.add_robot(model.urdf_path, model.joint_names, q, gripper=model.gripper)
+            recording = Recording(world)
+            assert robot.body >= 0
+            world.step(0.5)
+            if pushed:
+                beside = world.object_pose("left")
+                beside[2, 3] = world.object_pose("target")[2, 3]
+                beside[:2, 3] += 0.02
+                world.set_object_pose("target", beside)
+            recording.add()
+            recording.save(tmp_path / f"{name}.npz")
+    assert grasp_episodes.unwanted(recheck(scene, tmp_path / "standing.npz", watched="target")) == {}
+    found = grasp_episodes.unwanted(recheck(scene, tmp_path / "pushed.npz", watched="target"))
+    assert set(found) == {"target - left"}

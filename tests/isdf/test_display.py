@@ -42,6 +42,19 @@ def test_a_field_tells_its_size_and_shows_its_middle() -> None:
     assert np.ptp(axes.images[0].get_extent()[:2]) < np.ptp(axes.images[0].get_extent()[2:])
 
 
+def test_colours_fit_the_size_of_what_is_drawn() -> None:
+    """In a room they end where planners stop caring; a thing on a table of 40 cm would be pale then."""
+    limits = []
+    for half in (0.2, 0.5, 10.0):
+        region = torch.tensor([[-half, -half, 0.0], [half, half, 1.0]])
+        low, high = (
+            isdf.plot_slice(ball(), 0.5, bounds=region, spacing=half / 20).axes[0].images[0].get_clim()
+        )
+        assert low == -high
+        limits.append(high)
+    assert limits[0] < 0.2 and limits[0] < limits[1] < limits[2] == 1.5
+
+
 def test_up_bounds_and_path_are_followed() -> None:
     poses = np.stack([frame.T_world_camera.numpy() for frame in furnished_orbit(12)])
     region = torch.tensor([[-0.5, -0.5, 0.0], [0.5, 0.5, 2.0]])

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from planning.errors import ConfigError, FieldError
-from planning.grasping import GraspConfig, ParallelHand, find_grasps, hand_clearance
+from planning.grasping import GraspConfig, find_grasps
+from planning.hand_room import ParallelHand, RoomRound
+from planning.line_of_sight import in_sight
 from planning.object_surface import SurfaceConfig, object_surface
 from tests.planning.fields import AutogradField, Box, Union
 
@@ -35,17 +37,17 @@ class Turned(AutogradField):
         return self.field.distance(points @ self.turn)
 
 
-class SeenFrom(AutogradField):
-    """A field that is sure only of what lies on one side of a plane through the origin."""
+class Shell(AutogradField):
+    """What a map knows of a thing: a shell of a centimetre or two, and nothing solid in it."""
 
-    def __init__(self, field: AutogradField, side: tuple[float, float, float]) -> None:
-        self.field, self.side = field, torch.tensor(side)
+    THICK = 0.02
+
+    def __init__(self, field: AutogradField) -> None:
+        self.field = field
 
     def distance(self, points):
-        return self.field.distance(points)
-
-    def confidence(self, points):
-        return (points @ self.side > -0.02).float()
+        distance = self.field.distance(points)
+        return torch.maximum(distance, -distance - self.THICK)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5])
@@ -67,6 +69,13 @@ def test_where_nothing_stands_there_is_no_object() -> None:
     assert object_surface(TABLE, torch.tensor([0.1, 0.0, 0.7])) is None
     with pytest.raises(FieldError, match="finite"):
         object_surface(TABLE, torch.tensor([0.1, math.nan, 0.7]))
+    for wrong in (torch.zeros(2), torch.zeros(1, 3)):
+        with pytest.raises(FieldError, match="3 finite numbers, got shape"):
+            object_surface(TABLE, wrong)
+    beside = Union(TABLE, Box((0.2, 0.0, 0.76), (0.03, 0.03, 0.06)))
+    assert object_surface(beside, torch.tensor([0.05, 0.0, 0.7])) is None, (
+        "what stands elsewhere is not meant"
+    )
     with pytest.raises(ConfigError, match="positive"):
         SurfaceConfig(gap=0.0)
 
@@ -82,7 +91,7 @@ def test_grasps_close_across_the_narrow_side_and_touch_nothing(yaw: float) -> No
     assert across.min() > math.cos(math.radians(32)) and across[0] > math.cos(math.radians(12))
     assert (grasps.width - 0.05).abs()[across > 0.995].max() < 0.006
     assert (grasps.score.diff() <= 1e-6).all(), "the best first"
-    assert hand_clearance(field, grasps.T_world_tool, HAND, 0.12).min() >= GraspConfig().room
+    assert RoomRound(field, surface).clearance(grasps.T_world_tool, HAND, 0.12).min() >= GraspConfig().room
     tips = grasps.T_world_tool[:, :3, 3] + HAND.tips * grasps.T_world_tool[:, :3, 2]
     assert carton(yaw).distance(tips).max() < 0.0, "the object is between the fingers"
     turns = grasps.T_world_tool[:, :3, :3]
@@ -109,12 +118,109 @@ def test_the_robots_side_is_preferred() -> None:
         assert best[1] * math.sin(heading) > -0.01
 
 
+FRONT = torch.tensor([[0.0, -0.7, 1.1]])
+ABOVE = torch.tensor([[0.0, -0.7, 1.1], [0.0, 0.0, 1.8]])
+
+
+def test_lines_of_sight_tell_the_front_from_the_back() -> None:
+    field = Shell(Union(TABLE, carton()))
+    near, far = torch.tensor([[0.0, -0.077, 0.78]]), torch.tensor([[0.0, 0.077, 0.78]])
+    inside = torch.tensor([[0.0, -0.03, 0.76]])
+    assert bool(in_sight(field, near, FRONT)) and not bool(in_sight(field, far, FRONT))
+    assert not bool(in_sight(field, inside, FRONT)), "a shell is not all of a thing"
+    assert bool(in_sight(field, far, torch.cat([FRONT, torch.tensor([[0.0, 0.7, 1.1]])]))), (
+        "from any of the eyes"
+    )
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.5])
+def test_sides_that_nobody_saw_go_down_from_the_top(yaw: float) -> None:
+    """From the front a map has a shell; its back is no face of the thing, and the thing's back is guessed."""
+    field = Shell(Union(TABLE, carton(yaw)))
+    surface = object_surface(field, torch.tensor([0.0, 0.0, 0.823]), FRONT)
+    assert surface is not None
+    assert carton(yaw).distance(surface.points).abs().max() < 0.012, "the back of the shell is left out"
+    assert carton(yaw).distance(surface.points).abs().median() < 0.003
+    behind = torch.tensor([-math.sin(yaw), math.cos(yaw), 0.0])
+    back = surface.points[(surface.points @ behind > 0.065) & (surface.points[:, 2] < 0.79)]
+    assert len(back) > 50 and float((back @ behind - 0.075).abs().mean()) < 0.005
+
+
+def test_what_was_seen_to_be_free_is_not_filled() -> None:
+    """A plate on a stem has nothing under its rim where the camera looks under it."""
+    mushroom = Union(Box((0.0, 0.0, 0.81), (0.08, 0.08, 0.01)), Box((0.0, 0.0, 0.75), (0.015, 0.015, 0.05)))
+    eyes = torch.tensor([[0.0, -0.6, 0.78], [0.6, 0.0, 0.78], [-0.6, 0.0, 0.78]])
+    surface = object_surface(Union(TABLE, mushroom), torch.tensor([0.0, -0.08, 0.81]), eyes)
+    assert surface is not None
+    low = surface.points[surface.points[:, 2] < 0.78]
+    assert len(low) > 20
+    assert low[:, 1].min() > -0.04 and low[:, 0].abs().max() < 0.04
+
+
 def test_fingers_stay_out_of_space_that_nobody_saw() -> None:
-    """Seen from x < 0 only, a plate's far side is a guess; a finger there may meet anything."""
-    field = Union(TABLE, carton())
-    surface = object_surface(field, torch.tensor([0.0, 0.0, 0.823]))
-    assert len(find_grasps(SeenFrom(field, (-1.0, 0.0, 0.0)), surface, HAND)) == 0
-    assert len(find_grasps(SeenFrom(field, (0.0, 0.0, 1.0)), surface, HAND)) > 5
-    guessed = SeenFrom(field, (-1.0, 0.0, 0.0))
-    seen = object_surface(guessed, torch.tensor([0.0, 0.0, 0.823]))
-    assert seen is not None and seen.points[:, 0].max() <= 0.021
+    """Low behind a thing may be more of it."""
+    broad = Union(TABLE, Box((0.0, 0.0, 0.76), (0.1, 0.025, 0.06)))
+    at = torch.tensor([0.0, -0.025, 0.78])
+    strict = GraspConfig(seen=0.9, pitches=(math.pi / 2,), bites=(0.05,))
+    assert len(find_grasps(broad, object_surface(broad, at, FRONT), HAND, config=strict)) == 0
+    assert len(find_grasps(broad, object_surface(broad, at, ABOVE), HAND, config=strict)) > 5
+    low = torch.tensor([[0.0, 0.05, 0.72]])
+    assert bool(RoomRound(broad, object_surface(broad, at, FRONT)).hidden(low))
+    assert not bool(RoomRound(broad, object_surface(broad, at, ABOVE)).hidden(low))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.04])
+def test_flat_things_are_taken_from_above(tilt: float) -> None:
+    """A ruler 12 mm high, on a table that a camera's distortion tilts: the fingers end just above it."""
+    height = 0.012
+    field = Tilted(Union(TABLE, Box((0.0, 0.0, 0.7 + height / 2), (0.1, 0.012, height / 2))), tilt)
+    at = torch.tensor([0.0, 0.0, 0.7 + height])
+    surface = object_surface(field, at)
+    assert surface is not None and surface.support == pytest.approx(0.7, abs=0.002)
+    assert surface.points[:, 1].abs().max() < 0.016, "neither half of the table is part of it"
+    assert field.distance(surface.points).abs().max() < 0.004
+    assert surface.points[:, 0].max() - surface.points[:, 0].min() == pytest.approx(0.2, abs=0.012)
+    grasps = find_grasps(field, surface, HAND)
+    assert len(grasps) > 0
+    centres = (
+        HAND.centres @ grasps.T_world_tool[:, :3, :3].transpose(1, 2) + grasps.T_world_tool[:, None, :3, 3]
+    )
+    lowest = (centres[..., 2] - HAND.radii).amin(dim=1)
+    down = grasps.T_world_tool[:, 2, 2] < -0.2
+    assert down.any() and lowest[down].min() > 0.7 + 0.5 * GraspConfig().above
+    assert lowest[down].min() < 0.7 + height
+
+
+class Tilted(AutogradField):
+    """A field turned about the y axis through the table's middle, at its height."""
+
+    def __init__(self, field: AutogradField, angle: float) -> None:
+        c, s = math.cos(angle), math.sin(angle)
+        self.inner, self.turn = Lifted(field), torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+    def distance(self, points):
+        return self.inner.distance((points - torch.tensor([0.0, 0.0, 0.7])) @ self.turn)
+
+
+class Lifted(AutogradField):
+    """A field whose origin is the middle of the table's top."""
+
+    def __init__(self, field: AutogradField) -> None:
+        self.field = field
+
+    def distance(self, points):
+        return self.field.distance(points + torch.tensor([0.0, 0.0, 0.7]))
+
+
+def test_a_thing_is_taken_where_it_is_heavy() -> None:
+    """A hammer's head holds most of its volume; a hand at the end of the handle would let it turn."""
+    head, handle = Box((0.12, 0.0, 0.72), (0.03, 0.035, 0.02)), Box((-0.03, 0.0, 0.71), (0.13, 0.01, 0.01))
+    field = Union(TABLE, head, handle)
+    eyes = torch.tensor([[0.0, -0.5, 1.3], [0.0, 0.5, 1.3], [0.5, 0.0, 1.3], [-0.5, 0.0, 1.3]])
+    surface = object_surface(field, torch.tensor([-0.02, 0.0, 0.72]), eyes)
+    assert surface is not None
+    volumes = torch.tensor([0.06 * 0.07 * 0.04, 0.26 * 0.02 * 0.02])
+    middle = (volumes * torch.tensor([0.12, -0.03])).sum() / volumes.sum()
+    assert float(surface.middle[0]) == pytest.approx(float(middle), abs=0.02)
+    best = find_grasps(field, surface, HAND).T_world_tool[:3, 0, 3]
+    assert (best - middle).abs().max() < 0.06
