@@ -15,8 +15,10 @@ from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.drive import DriveStatus
 from planning.explored import ExploredField
 from planning.gaze import GazeConfig
+from planning.grid_search import GridSearchConfig, grid_search
 from planning.protocols import ObservingField
 from planning.replanning import ReplanningLoop
+from planning.workspace import WorkspaceConfig
 from tests.planning.fields import AutogradField, Box, Confident
 from tests.planning.test_replanning import BODY, FREE, QUICK, drive
 from tests.planning.unicycles import Unicycle
@@ -80,6 +82,19 @@ def test_a_seen_detour_is_taken_rather_than_a_short_cut_that_was_not_seen() -> N
     assert float(plan.result.trajectory.waypoints[:, 1].max()) > 0.9
 
 
+@pytest.mark.parametrize(("price", "least", "most"), [(1.0, -0.3, 0.3), (2.0, 0.8, 1.6)])
+def test_the_way_through_unknown_space_has_its_price(price: float, least: float, most: float) -> None:
+    class Seen(Confident):
+        def confidence(self, points: Tensor) -> Tensor:
+            hidden = (points[..., 0] > 1.0) & (points[..., 0] < torch.where(points[..., 1] < 1.0, 3.0, 1.4))
+            return (~hidden).to(points)
+
+    config = GridSearchConfig(through_unknown=price, workspace=WorkspaceConfig(unknown_confidence=0.5))
+    route = grid_search(Disc(radius=0.25), Seen(FREE, 0.0), START, torch.tensor([4.0, 0.0]), config)
+    assert not route.reaches_goal and least < float(route.onward[0, 1]) < most
+    assert torch.equal(route.entry, route.onward[0])
+
+
 def test_a_field_that_does_not_tell_is_taken_at_its_word() -> None:
     assert BasePlanner(BODY).plan(START, torch.tensor([3.0, 0.0]), FREE).reaches_goal
 
@@ -139,7 +154,7 @@ def test_before_a_dead_end_it_turns_to_where_the_way_would_go_on() -> None:
     _loop, _ = drive(
         robot,
         Observed(FREE, torch.zeros(1, 2), 0.3),
-        replace(QUICK, planner=BasePlannerConfig(), time_limit=9.0),
+        replace(QUICK, planner=BasePlannerConfig(room=0.05), time_limit=9.0),
         goal=goal,
     )
     assert abs(math.remainder(robot.state[2] - math.pi, 2 * math.pi)) < 0.4
