@@ -250,7 +250,7 @@ class ReplanningLoop:
     def _follow(self, duration: float, final_yaw: float | None) -> None:
         """Let time pass on the plan; without one, turn on the spot to see more."""
         if self.plan is None:
-            turn = self._turn_onward(self.robot.base_state())
+            turn = self._turn_onward(self.robot.base_state(), duration)
             self._pass_time(duration, lambda _: (0.0, turn))
             return
         path = self.plan.trajectory.waypoints.numpy().astype(float)
@@ -308,10 +308,10 @@ class ReplanningLoop:
         self.report.note(self.robot.time - self._started, reason)
         logger.info("no plan: %s", reason)
 
-    def _turn_onward(self, state: ndarray) -> float:
+    def _turn_onward(self, state: ndarray, duration: float) -> float:
         """Look along where the way would go on, if there is one, and else around; returns the turning rate.
 
-        The next attempt waits until the camera faces that way.
+        The next attempt waits until the camera has faced that way; turning goes on for `duration` [s].
         """
         far = self._onward[np.linalg.norm(self._onward - state[:2], axis=1) > self.config.gaze.near]
         if len(far) == 0:
@@ -322,7 +322,7 @@ class ReplanningLoop:
         error = math.remainder(heading - state[2], 2 * math.pi)
         self.gaze.towards(state[:2], heading)
         if abs(error) > FACING:
-            self._retry_at = max(self._retry_at, self.robot.time + self.config.retry)
+            self._retry_at = max(self._retry_at, self.robot.time + duration + self.config.retry)
         return float(np.clip(error, -self.config.scan_rate, self.config.scan_rate))
 
     def _end(self, status: DriveStatus, message: str) -> None:

@@ -90,7 +90,7 @@ def test_the_way_through_unknown_space_has_its_price(price: float, least: float,
             return (~hidden).to(points)
 
     config = GridSearchConfig(through_unknown=price, workspace=WorkspaceConfig(unknown_confidence=0.5))
-    route = grid_search(Disc(radius=0.25), Seen(FREE, 0.0), START, torch.tensor([4.0, 0.0]), config)
+    route = grid_search(BODY, Seen(FREE, 0.0), START, torch.tensor([4.0, 0.0]), config)
     assert not route.reaches_goal and least < float(route.onward[0, 1]) < most
     assert torch.equal(route.entry, route.onward[0])
 
@@ -151,12 +151,9 @@ def test_what_can_never_be_seen_is_given_up() -> None:
 def test_before_a_dead_end_it_turns_to_where_the_way_would_go_on() -> None:
     goal = np.array([-3.0, 0.0])  # behind it
     robot = Unicycle()
-    _loop, _ = drive(
-        robot,
-        Observed(FREE, torch.zeros(1, 2), 0.3),
-        replace(QUICK, planner=BasePlannerConfig(room=0.05), time_limit=9.0),
-        goal=goal,
-    )
+    config = replace(QUICK, planner=BasePlannerConfig(room=0.05))
+    _, report = drive(robot, Observed(FREE, torch.zeros(1, 2), 0.04), config, goal=goal)
+    assert report.status is DriveStatus.UNREACHABLE, "not before it had looked there"
     assert abs(math.remainder(robot.state[2] - math.pi, 2 * math.pi)) < 0.4
     assert robot.looked_at[-1][0] < robot.state[0]
 
