@@ -128,14 +128,7 @@ class GraspEpisode:
                 self.reason = chosen if ended == "planning" else f"{self.reason}, then {chosen}"
                 return ended
             self.bar.set_description("grasping")
-            self.chosen = chosen[0]
-            self.film.tool_way = self.tool_way()
-            self.film.close_map = None if self.looked is None else self.looked[0]
-            if self.film not in self.episode.robot.disturbances:
-                self.episode.robot.disturbances.append(self.film)
-            self.film.close_up = self.point
-            self.episode.live.reach([chosen[1], chosen[0].approach, chosen[0].lift])
-            self.episode.live.say("grasping")
+            self.show(*chosen)
             self.tries += 1
             self.lift_height = take(self.episode, *chosen, name, self.film.add)
             ended, self.reason = "lift", "slipped out of the hand"
@@ -149,6 +142,17 @@ class GraspEpisode:
                 return ended
             self.close = CloseLook(self.episode, self.point, self.clock, self.film.add)  # it may have moved
         return ended
+
+    def show(self, grasp: Grasp, reach: torch.Tensor) -> None:
+        """Have film and viewer show what the arm is about to do."""
+        self.chosen = grasp
+        self.film.tool_way = self.tool_way()
+        self.film.close_map = None if self.looked is None else self.looked[0]
+        if self.film not in self.episode.robot.disturbances:
+            self.episode.robot.disturbances.append(self.film)
+        self.film.close_up = self.point
+        self.episode.live.reach([reach, grasp.approach, grasp.lift])
+        self.episode.live.say("grasping")
 
     def places(self) -> Iterator[tuple[float, float, float]]:
         """Places to park, each by the newest map and away from the earlier ones."""

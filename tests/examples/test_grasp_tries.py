@@ -37,7 +37,7 @@ def pretended(monkeypatch, heights: list[float], felt_empty: bool = True) -> Sim
     episode.film = SimpleNamespace(add=lambda *_: None, close_up=None)
     episode.options = SimpleNamespace(margin=0.02, seed=0)
     episode.point, episode.clock, episode.tries, episode.reason = np.zeros(3), None, 0, "no place"
-    episode.plan = lambda: (None, None)
+    episode.plan, episode.show = lambda: (None, None), lambda *_: None
     did.ended = episode.grasp_from_here()
     did.episode = episode
     return did
