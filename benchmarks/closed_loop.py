@@ -5,9 +5,9 @@
     python -m benchmarks.closed_loop navigate --method exact --backend dask --cluster tcp://host:8786
     python -m benchmarks.closed_loop grasp --objects FOLDER --episodes 50 --out runs/grasps
 
-Every episode leaves report.json and states.npz (time, base pose, joint positions, poses of everything that moves) in
-OUT/SCENE/METHOD/DISTURBANCE/NUMBER or OUT/OBJECTS/METHOD/NUMBER, the summary is OUT/summary.md. Contacts are counted
-twice: by the physics while it runs, and from the recorded states in a fresh world.
+Every episode leaves report.json, summary.png and states.npz (time, base pose, joint positions, poses of everything that
+moves) in OUT/SCENE/METHOD/DISTURBANCE/NUMBER or OUT/OBJECTS/METHOD/NUMBER, the summary is OUT/summary.md. Contacts are
+counted twice: by the physics while it runs, and from the recorded states in a fresh world.
 """
 
 from __future__ import annotations

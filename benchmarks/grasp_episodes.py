@@ -99,12 +99,15 @@ class GraspTaskOf:
             "planning_seconds": grasping.planning_seconds,
             "robot_seconds": grasping.episode.robot.time,
         }
+        spent = time.process_time() - began
+        line = f"{Path(self.thing).name}, {self.support}, episode {self.number}: {ended} {grasping.reason}"
+        grasping.save_summary(folder / "summary.png", line)
         grasping.episode.close()
         again = unwanted(recheck(self.the_scene(), folder / "states.npz", watched="target"))
         return report | {
             "success": ended == "success" and not contacts and not again,
             "contacts_rechecked": again,
-            "cpu_seconds": time.process_time() - began,
+            "cpu_seconds": spent,
         }
 
 

@@ -17,6 +17,7 @@ from benchmarks.recheck import recheck
 from examples.disturbances import Disturbance, MovedFurniture, People, PoseNoise
 from examples.episode import Episode, EpisodeOptions
 from examples.maps import Method
+from examples.summary import drive_summary
 from planning.replanning import ReplanningConfig, ReplanningLoop
 from robots.simulation import Scene, SimulatedMobileRobot, load_urdf_scene, make_scene
 
@@ -164,17 +165,21 @@ def episode(task: NavigationTask) -> dict:
     contacts = ride.contacts()
     folder.mkdir(parents=True, exist_ok=True)
     ride.robot.recording.save(folder / "states.npz")
+    spent = time.process_time() - began
+    plan = None if loop.plan is None else loop.plan.trajectory.waypoints.numpy()
+    line = f"{Path(task.scene).stem}, episode {task.number}: {drive.message}, {len(contacts)} contacts"
+    drive_summary(folder / "summary.png", ride, np.array(task.goal), plan, line)
     ride.close()
     again = recheck(task.the_scene(), folder / "states.npz")
     return {
-        "success": drive.success and drive.goal_distance < 0.1 and not contacts,
+        "success": drive.success and drive.goal_distance < 0.1 and not contacts and not again,
         "reached": drive.success and drive.goal_distance < 0.1,
         "contacts": contacts,
         "contacts_rechecked": again,
         "drive": dataclasses.asdict(drive) | {"status": drive.status.value},
         "length_ratio": drive.path_length / task.shortest,
         "planning_times": planning_times,
-        "cpu_seconds": time.process_time() - began,
+        "cpu_seconds": spent,
     }
 
 

@@ -214,6 +214,11 @@ class GraspEpisode:
             raise_torso(self.episode, tucked)
         return found
 
+    def save_summary(self, path: Path, line: str) -> None:
+        """One picture of the episode, with what happened in a line."""
+        name, way = self.task.object_name, self.tool_way()
+        grasp_summary(path, self.episode, self.point, name, self.looked, way, line)
+
     def tool_way(self) -> np.ndarray | None:
         """Where the hand was to go on its last straight line (n, 3) [m]."""
         if self.chosen is None:
@@ -275,9 +280,9 @@ def main(options: GraspOptions) -> dict:
     episode.robot.recording.save(options.out / "states.npz")
     episode.save_map(options.out / "map.safetensors")
     save_map_picture(options.out / "map.png", episode, grasping.point)
-    line = f"{options.scene}, seed {options.seed}: {headline(report)}"
-    name, way = grasping.task.object_name, grasping.tool_way()
-    grasp_summary(options.out / "summary.png", episode, grasping.point, name, grasping.looked, way, line)
+    grasping.save_summary(
+        options.out / "summary.png", f"{options.scene}, seed {options.seed}: {headline(report)}"
+    )
     if options.film:
         grasping.film.save(options.out / "episode.gif")
     write_report(options.out, report, headline(report))
