@@ -44,6 +44,8 @@ def hidden_sides(
     free = _seen_free(field, centres, eyes).numpy().reshape(*top.shape, layers)
     heights = (np.arange(layers) + 0.5) * CELL
     filled = (heights < top[..., None]) & ~free
+    if not filled.any():
+        return points[:0], points[:0], points.mean(dim=0)
     middle = corner + CELL * (torch.from_numpy(np.argwhere(filled)).float().mean(dim=0) + 0.5)
     sides, normals = _walls(filled, corner)
     away, _ = cKDTree(points.numpy()).query(sides.numpy())

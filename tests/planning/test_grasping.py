@@ -10,9 +10,10 @@ import torch
 from planning.errors import ConfigError, FieldError
 from planning.grasping import GraspConfig, find_grasps
 from planning.hand_room import ParallelHand, RoomRound
+from planning.hidden_sides import hidden_sides
 from planning.line_of_sight import in_sight
 from planning.object_surface import SurfaceConfig, object_surface
-from tests.planning.fields import AutogradField, Box, Union
+from tests.planning.fields import AutogradField, Box, Sphere, Union
 
 TABLE = Box((0.0, 0.0, 0.35), (0.5, 0.3, 0.35))  # its top is at 0.7 m
 HAND = ParallelHand(
@@ -155,6 +156,14 @@ def test_what_was_seen_to_be_free_is_not_filled() -> None:
     low = surface.points[surface.points[:, 2] < 0.78]
     assert len(low) > 20
     assert low[:, 1].min() > -0.04 and low[:, 0].abs().max() < 0.04
+
+
+def test_where_all_was_seen_to_be_free_no_side_is_guessed() -> None:
+    points = torch.tensor([[0.0, 0.0, 0.05], [0.02, 0.0, 0.05], [0.0, 0.02, 0.06]])
+    far = Sphere((0.0, 0.0, 50.0), 0.1)
+    sides, normals, middle = hidden_sides(far, points, 0.0, torch.tensor([[1.0, 0.0, 1.0]]))
+    assert len(sides) == len(normals) == 0
+    torch.testing.assert_close(middle, points.mean(dim=0))
 
 
 def test_fingers_stay_out_of_space_that_nobody_saw() -> None:
