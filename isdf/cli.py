@@ -248,7 +248,7 @@ DESCRIPTION = """Signed distance fields from posed depth images.
   isdf query FOLDER --points P.npy --out ANSWERS.npz   distances and gradients
   isdf export FOLDER --format ply --out MESH.ply       for other programs
   isdf info FOLDER                                     what a map file says
-  isdf view RECORDING                                  in the browser: a recording, or a map
+  isdf view RECORDING                                  a recording, or a map
   isdf COMMAND --help                                  the options of a command
   --json: outcome or error as one line of JSON on stdout or stderr
   exit codes:

@@ -237,15 +237,15 @@ class Mapper(ShownMapper):
     ) -> np.ndarray:
         """Corners (2, 3) [m] of the box that holds the camera and all it sees, to the end of the truncation."""
         stride = max(1, depth.shape[1] // COLUMNS)
-        v, u = np.nonzero(depth[::stride, ::stride])
-        z = depth[::stride, ::stride][v, u]
+        v, u = (stride * index for index in np.nonzero(depth[::stride, ::stride]))
+        if len(v) == 0:  # what little there is lies between
+            v, u = np.nonzero(depth)
+        z = depth[v, u]
         band = np.maximum(self.config.truncation, self.config.truncation_noise * z * z)
         # The farthest pixel counts, whatever the stride: it decides whether every brick has a place in the table.
         z = z + band + 0.1 + (depth.max() - z) * (z == z.max())
         camera = frame.camera
-        rays = np.stack(
-            [(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1
-        )
+        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
         points = (rays * z[:, None]) @ T[:3, :3].T + T[:3, 3]
         return np.stack([np.minimum(points.min(axis=0), T[:3, 3]), np.maximum(points.max(axis=0), T[:3, 3])])
 

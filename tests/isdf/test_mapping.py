@@ -347,3 +347,11 @@ def test_it_knows_what_was_looked_through():
     mapper.integrate(render(scene(), look_at((-1.6, -1.5, 1.3), (-1.5, -1.5, 3.0)), CAMERA, 2.5))
     assert mapper.field().observed(places).tolist() == [True, True, True, False, False]
     assert field.observed(places).tolist() == [True, True, False, False, False], "a snapshot does not change"
+
+
+def test_an_image_with_one_pixel_left_is_no_error_wherever_that_is():
+    camera, depth = PinholeCamera.from_fov(320, 240, math.radians(60)), torch.zeros(240, 320)
+    depth[101, 203] = 1.0
+    mapper = Mapper()
+    mapper.integrate(DepthFrame(depth, torch.eye(4), camera))
+    assert mapper.frames_seen == 1
