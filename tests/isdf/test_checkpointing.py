@@ -155,8 +155,8 @@ def test_the_live_clock_goes_on_where_it_stood(config, tmp_path) -> None:
     with pytest.raises(Stopped), Checkpointer(path, 1.0, report, {}, interrupt) as watch:
         run_at_rate(sequence, config, 0.3, watch, Begun(report))
     begun, options = take_up(path)
-    # Stopped at the call after the signal, if not at that one.
-    assert options == {} and 12 < begun.report.frames_arrived <= 20
+    # Stopped at the call after the signal, if not at that one; on a busy machine many frames arrive between the two.
+    assert options == {} and 12 < begun.report.frames_arrived < 30
     spent = begun.report.cpu_seconds + begun.report.waited_seconds
     assert 0.3 * 1.2 <= spent < 0.8
     mapper, whole = run_at_rate(sequence, config, 0.3, lambda *_: None, begun)
