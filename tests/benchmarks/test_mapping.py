@@ -205,6 +205,7 @@ def test_held_out_frames_judge_a_map_of_the_others(study) -> None:
     assert values["held_out"]["median_error"] < 0.05 and values["held_out"]["blocked"] < 0.02
 
 
+@pytest.mark.slow
 def test_every_method_of_the_comparison_is_judged(recorded, tmp_path) -> None:
     assert mapping.main(options(recorded, tmp_path, experiments=("main",), methods=())) == []
     results = [json.loads(path.read_text()) for path in (tmp_path / "out" / "main").glob("*.json")]
