@@ -10,7 +10,7 @@ from torch import Tensor
 
 from planning.chomp import Chomp, ChompConfig
 from planning.errors import ConfigError
-from planning.explored import ExploredField
+from planning.explored import ExploredField, Trodden
 from planning.grid_search import GridSearchConfig, Route, grid_search
 from planning.protocols import ConfidentField, DistanceField, ObservingField, SphereRobot
 from planning.result import PlanResult
@@ -111,7 +111,7 @@ class BasePlanner:
     def __init__(self, body: SphereRobot, config: BasePlannerConfig | None = None, seed: int = 0) -> None:
         self.body, self.config, self.seed = body, config or BasePlannerConfig(), seed
         self._entries: list[tuple[float, Tensor]] = []
-        self._trodden: list[Tensor] = []
+        self._trodden, self._last = Trodden(), torch.full((2,), torch.inf)
         centres, _ = body.spheres(torch.zeros(2))
         self._reach = float(centres[:, :2].norm(dim=1).max()) + 0.5 * self.config.search.spacing
 
@@ -121,10 +121,10 @@ class BasePlanner:
 
     def stood(self, position: Float[Tensor, "2"]) -> None:
         """Take note that the base has been at a position [m]: space there is free, whether or not it was seen."""
-        if not self._trodden:
-            self._trodden.append(torch.cat([position, position.new_tensor([self.config.room])]))
-        if (self._trodden[-1][:2] - position).norm() > 0.5 * self.config.search.spacing:
-            self._trodden.append(torch.cat([position, position.new_tensor([self._reach])]))
+        if (self._last - position).norm() > 0.5 * self.config.search.spacing:
+            put_down = not bool(torch.isfinite(self._last).all())
+            self._trodden.add(position.double().numpy(), self.config.room if put_down else self._reach)
+            self._last = position
 
     @one_thread
     def plan(
@@ -170,7 +170,7 @@ class BasePlanner:
     def _explored(self, sdf: DistanceField) -> DistanceField:
         """The field with what it has not seen as unknown; the field itself where it does not tell."""
         if isinstance(sdf, ObservingField | ConfidentField):
-            return ExploredField(sdf, torch.stack(self._trodden))
+            return ExploredField(sdf, self._trodden)
         return sdf
 
     def _optimised(self, route: Route, sdf: DistanceField) -> PlanResult:

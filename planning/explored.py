@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import no_type_check
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numba import njit
@@ -17,6 +18,29 @@ SEEN = 0.5
 CELL = 0.05
 
 
+class Trodden:
+    """Where a base has been, on a grid in plan that grows with its way."""
+
+    def __init__(self) -> None:
+        self.low = np.zeros(2)
+        """Middle of the first cell [m]."""
+        self.cells = np.zeros((0, 0), dtype=np.bool_)
+
+    def add(self, position: Float[np.ndarray, "2"], radius: float) -> None:
+        """A disc [m] counts as seen from now on."""
+        begin = np.floor((position - radius) / CELL).astype(int)
+        end = np.ceil((position + radius) / CELL).astype(int) + 1
+        first = np.round(self.low / CELL).astype(int) if self.cells.size else begin
+        before = np.maximum(first - begin, 0)
+        after = np.maximum(end - (first + self.cells.shape), 0)
+        self.cells = np.pad(self.cells, np.stack([before, after], axis=1))
+        first = first - before
+        self.low = CELL * first
+        x, y = (CELL * np.arange(begin[axis], end[axis]) - position[axis] for axis in (0, 1))
+        part = tuple(slice(*(ends - first[axis])) for axis, ends in enumerate(np.stack([begin, end], axis=1)))
+        self.cells[part] |= np.hypot(x[:, None], y) <= radius
+
+
 class ExploredField:
     """A distance field with confidence 1 where the base may drive and 0 in space nobody has looked at.
 
@@ -25,17 +49,11 @@ class ExploredField:
 
     Args:
         field: distances; it tells what was seen by `observed`, or else by `confidence`.
-        trodden: (n, 3) discs in plan that count as seen, at least one: x, y and radius [m].
+        trodden: where the base has been; what is added to it later counts as well.
     """
 
-    def __init__(self, field: ObservingField | ConfidentField, trodden: Float[Tensor, "n 3"]) -> None:
-        self.field = field
-        middle, radius = trodden[:, :2], trodden[:, 2:]
-        low, high = (middle - radius).amin(dim=0), (middle + radius).amax(dim=0)
-        axes = [torch.arange(float(low[i]), float(high[i]) + CELL, CELL, dtype=trodden.dtype) for i in (0, 1)]
-        grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-        inside = (torch.cdist(grid.view(-1, 2), middle) <= radius.T).any(dim=1)
-        self._low, self._trodden = low.numpy(), inside.view(grid.shape[:2]).numpy()
+    def __init__(self, field: ObservingField | ConfidentField, trodden: Trodden) -> None:
+        self.field, self.trodden = field, trodden
 
     def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Signed distances [m] of the field."""
@@ -50,7 +68,7 @@ class ExploredField:
     def confidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """1 where a point [m] was looked at or is trodden, else 0."""
         seen = self._observed(points).cpu().numpy().ravel()
-        _add_trodden(points.detach().cpu().numpy().reshape(-1, 3), self._low, self._trodden, seen)
+        _add_trodden(points.detach().cpu().numpy().reshape(-1, 3), self.trodden.low, self.trodden.cells, seen)
         return torch.from_numpy(seen).to(points).view(points.shape[:-1])
 
     def _observed(self, points: Tensor) -> Bool[Tensor, "*batch"]:

@@ -22,7 +22,7 @@ import torch
 from ..atomic import replacing
 from ..camera import PinholeCamera
 from ..errors import ViewerError
-from ..field import GridField, grid_points
+from ..field import ConfidentGridField, grid_points
 from .pictures import confidence_of
 from .state import Compose, Line, Shape, Spheres, ViewState
 from .surface import spacing_for
@@ -37,18 +37,6 @@ WIDTH = 160
 """Columns of a recorded image, at most."""
 STEP = 0.001
 """Distances are kept to this [m]."""
-
-
-class RecordedField(GridField):
-    """A distance field as it was recorded: on a grid, with confidences."""
-
-    def __init__(self, values: torch.Tensor, confidence: torch.Tensor, origin: torch.Tensor, spacing: float):
-        super().__init__(values, origin, spacing)
-        self._sure = GridField(confidence, origin, spacing)
-
-    def confidence(self, points: torch.Tensor) -> torch.Tensor:
-        """In [0, 1]."""
-        return self._sure.distance(points)
 
 
 class Recorder:
@@ -207,11 +195,11 @@ class Recording:
             raise ViewerError(f"{path}: unreadable ({error})") from error
         return about if isinstance(about, dict) else {}
 
-    def _field(self, number: int) -> RecordedField:
+    def _field(self, number: int) -> ConfidentGridField:
         _, arrays = _load(self.folder / f"field_{number:06d}.npz")
         values = torch.from_numpy(arrays["steps"].astype(np.float32) * STEP)
         sure = torch.from_numpy(arrays["confidence"].astype(np.float32) / 255)
-        return RecordedField(values, sure, torch.from_numpy(arrays["origin"]), float(arrays["spacing"]))
+        return ConfidentGridField(values, torch.from_numpy(arrays["origin"]), float(arrays["spacing"]), sure)
 
     def _shape(self, number: int) -> Shape:
         about, arrays = _load(self.folder / f"shape_{number:06d}.npz")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.drive import DriveStatus
-from planning.explored import ExploredField
+from planning.explored import ExploredField, Trodden
 from planning.gaze import GazeConfig
 from planning.grid_search import GridSearchConfig, grid_search
 from planning.protocols import ObservingField
@@ -24,7 +24,15 @@ from tests.planning.test_replanning import BODY, FREE, QUICK, drive
 from tests.planning.unicycles import Unicycle
 
 START = torch.zeros(2)
-TRAIL = torch.tensor([[0.0, 0.0, 0.5], [1.0, 0.0, 0.45]])
+TRAIL = ((0.0, 0.0, 0.5), (1.0, 0.0, 0.45))
+
+
+def trodden(*discs: tuple[float, float, float]) -> Trodden:
+    """Discs x, y, radius [m] that the base has been in."""
+    been = Trodden()
+    for x, y, radius in discs:
+        been.add(np.array([x, y]), radius)
+    return been
 
 
 @dataclass
@@ -48,7 +56,7 @@ class Observed(AutogradField):
 def test_known_is_what_was_looked_at_and_where_the_base_has_been() -> None:
     seen = Observed(FREE, torch.tensor([[5.0, 0.0]]), 1.0)
     assert isinstance(seen, ObservingField)
-    explored = ExploredField(seen, TRAIL)
+    explored = ExploredField(seen, trodden(*TRAIL))
     at = torch.tensor(
         [[5.5, 0.0, 0.3], [0.0, 0.4, 9.0], [1.4, 0.0, 0.1], [0.52, 0.3, 0.1], [1.6, 0.0, 0.1], [-3, 9, 0.0]]
     )
@@ -59,7 +67,7 @@ def test_known_is_what_was_looked_at_and_where_the_base_has_been() -> None:
 
 
 def test_a_confidence_tells_as_well_what_was_looked_at() -> None:
-    explored = ExploredField(Confident(FREE, 2.0), TRAIL)
+    explored = ExploredField(Confident(FREE, 2.0), trodden(*TRAIL))
     assert explored.confidence(torch.tensor([[1.9, 3.0, 0.0], [2.1, 3.0, 0.0]])).tolist() == [1, 0]
 
 
@@ -69,7 +77,7 @@ def test_a_plan_ends_before_space_that_was_not_looked_at(seen) -> None:
     assert plan.usable and not plan.reaches_goal
     ends = plan.result.trajectory.waypoints
     centres, _ = BODY.spheres(ends)
-    assert bool(ExploredField(seen, torch.tensor([[0.0, 0.0, 0.5]])).confidence(centres).all())
+    assert bool(ExploredField(seen, trodden((0.0, 0.0, 0.5))).confidence(centres).all())
     assert 0.7 < float(ends[-1, 0]) <= 1.0
     torch.testing.assert_close(plan.onward[-1], torch.tensor([3.0, 0.0]), atol=0.06, rtol=0)
 
@@ -128,10 +136,9 @@ def test_the_robot_drives_only_where_it_has_looked_and_still_arrives() -> None:
     def watch(loop: ReplanningLoop) -> None:
         if loop.plan is not None:
             centres, _ = BODY.spheres(loop.plan.trajectory.waypoints)
-            trail = torch.tensor(np.array(robot.states)[::20, :2], dtype=torch.float32)
-            trodden = torch.cat([trail, torch.full((len(trail), 1), 0.16)], dim=1)
-            trodden[0, 2] = 0.56
-            plans.append(bool(ExploredField(loop.field, trodden).confidence(centres).all()))
+            been = [(float(x), float(y), 0.16) for x, y, _ in robot.states[::20]]
+            trail = trodden((*robot.states[0][:2], 0.56), *been)
+            plans.append(bool(ExploredField(loop.field, trail).confidence(centres).all()))
 
     _loop, report = drive(robot, knows, replace(QUICK, planner=BasePlannerConfig()), watch=watch)
     assert report.success and len(plans) > 5 and all(plans)
@@ -176,3 +183,12 @@ def test_bad_ways_of_looking_are_refused(values: dict) -> None:
 def test_bad_memories_are_refused(values: dict) -> None:
     with pytest.raises(Exception, match=next(iter(values))):
         BasePlannerConfig(**values)
+
+
+def test_the_trail_grows_every_way_and_forgets_nothing() -> None:
+    discs = [(0.0, 0.0, 0.2), (3.0, 0.1, 0.3), (-2.0, -1.0, 0.25), (0.4, 5.0, 0.2), (0.5, 0.5, 0.2)]
+    explored = ExploredField(Observed(FREE, torch.full((1, 2), 99.0), 0.0), trodden(*discs))
+    at = torch.tensor(np.random.default_rng(0).uniform(-4, 6, (20_000, 3)), dtype=torch.float32)
+    gaps = torch.stack([(at[:, :2] - torch.tensor([x, y])).norm(dim=1) - r for x, y, r in discs]).amin(dim=0)
+    known = explored.confidence(at) > 0
+    assert known[gaps < -0.04].all() and not known[gaps > 0.04].any() and int(known.sum()) > 20
