@@ -186,7 +186,7 @@ def test_bad_memories_are_refused(values: dict) -> None:
 
 
 def test_the_trail_grows_every_way_and_forgets_nothing() -> None:
-    discs = [(0.0, 0.0, 0.2), (3.0, 0.1, 0.3), (-2.0, -1.0, 0.25), (0.4, 5.0, 0.2), (0.5, 0.5, 0.2)]
+    discs = [(0.0, 0.0, 0.2), (3.0, 0.1, 0.3), (-2.0, -1.0, 0.25), (0.4, 5.0, 0.2), (0.2, 0.2, 0.2)]
     explored = ExploredField(Observed(FREE, torch.full((1, 2), 99.0), 0.0), trodden(*discs))
     at = torch.tensor(np.random.default_rng(0).uniform(-4, 6, (20_000, 3)), dtype=torch.float32)
     gaps = torch.stack([(at[:, :2] - torch.tensor([x, y])).norm(dim=1) - r for x, y, r in discs]).amin(dim=0)
