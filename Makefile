@@ -17,8 +17,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: setup      ## a robot maps an unknown room and drives across it: runs/demo/report.html
 	$(RUN) -m examples.navigate --out runs/demo --scene apartment --seed 0
 
-test: setup      ## all tests but the slow ones
-	$(RUN) -m pytest
+test: setup      ## all tests but the slow ones, one process a core
+	$(RUN) -m pytest -n auto --dist loadfile
 
 test-slow: setup  ## the slow tests
 	$(RUN) -m pytest -m slow
