@@ -12,6 +12,7 @@ from planning.chomp import Chomp, ChompConfig
 from planning.errors import ConfigError
 from planning.explored import ExploredField, Trodden
 from planning.grid_search import GridSearchConfig, Route, grid_search
+from planning.once_free import OnceFree
 from planning.protocols import ConfidentField, DistanceField, ObservingField, SphereRobot
 from planning.result import PlanResult
 from planning.threads import one_thread
@@ -33,6 +34,9 @@ class BasePlannerConfig:
         off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
         looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
         memory: blocked space is given another chance after this long [s], for the world changes.
+        memory_came: the same [s] for space that was free before: what came there may go again.
+        stand_off: distance [m] to keep from what came into the way, to see all of it down to the floor, and to let it
+            pass.
         room: unknown space this near [m] to the axis of the base, where it was put down, counts as free: a camera on
             the robot does not see the floor round its feet. Later on only the space that the base has been in does.
     """
@@ -51,18 +55,22 @@ class BasePlannerConfig:
     off_path: float = 0.25
     looks: int = 3
     memory: float = 30.0
+    memory_came: float = 10.0
+    stand_off: float = 1.0
     room: float = 0.5
 
     def __post_init__(self) -> None:
         low = self.num_waypoints < 3 or self.looks < 1
         if (
             low
-            or not min(self.clearance_change, self.off_path, self.memory, self.room) > 0
+            or not min(self.clearance_change, self.off_path, self.memory, self.memory_came, self.room) > 0
+            or not self.stand_off >= 0
             or not self.margin >= self.search.least_margin
         ):
             raise ConfigError(
-                "BasePlannerConfig: clearance_change, off_path, memory and room must be positive, num_waypoints at "
-                f"least 3, looks at least 1 and margin at least search.least_margin, got {self}."
+                "BasePlannerConfig: clearance_change, off_path, memory, memory_came and room must be positive, "
+                "stand_off not negative, num_waypoints at least 3, looks at least 1 and margin at least "
+                f"search.least_margin, got {self}."
             )
 
 
@@ -76,12 +84,14 @@ class BasePlan:
         dead_end: whether it leads nowhere, because the robot stands where it ends already.
         onward: (m, 2) how it would go on through unknown or blocked space [m]: what is to be looked at. Empty if it
             reaches the goal or no way leads there.
+        came: whether something came into the way, where it was free before.
     """
 
     result: PlanResult
     reaches_goal: bool
     dead_end: bool
     onward: Float[Tensor, "m 2"]
+    came: bool
 
     @property
     def usable(self) -> bool:
@@ -92,7 +102,7 @@ class BasePlan:
     def reason(self) -> str:
         """Why it is not."""
         if self.dead_end:
-            return "no way leads nearer to the goal"
+            return "something came into the way" if self.came else "no way leads nearer to the goal"
         return f"{self.result.status.value}: {self.result.message}"
 
 
@@ -110,7 +120,8 @@ class BasePlanner:
 
     def __init__(self, body: SphereRobot, config: BasePlannerConfig | None = None, seed: int = 0) -> None:
         self.body, self.config, self.seed = body, config or BasePlannerConfig(), seed
-        self._entries: list[tuple[float, Tensor]] = []
+        self._entries: list[tuple[float, Tensor, bool]] = []
+        self._once_free = OnceFree(self.config.search.spacing)
         self._trodden, self._last = Trodden(), torch.full((2,), torch.inf)
         centres, _ = body.spheres(torch.zeros(2))
         self._reach = float(centres[:, :2].norm(dim=1).max()) + 0.5 * self.config.search.spacing
@@ -144,18 +155,30 @@ class BasePlanner:
             route: the way from start to goal, if it was searched already.
             now: time [s], to know how old a dead end is.
         """
-        self._entries = [(when, place) for when, place in self._entries if now - when < self.config.memory]
-        route = route or self.route(start, goal, sdf)
+        route = route or self.route(start, goal, sdf, now)
+        came = route.entry is not None and route.entry in self._once_free
+        if came:
+            route = self._standing_off(route)
         result = self._optimised(route, self._explored(sdf))
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
-            self._entries.append((now, route.entry))
-        return BasePlan(result, route.reaches_goal, dead_end, route.onward)
+            self._entries.append((now, route.entry, came))
+        self._once_free.add(route.grid.free)
+        return BasePlan(result, route.reaches_goal, dead_end, route.onward, came)
 
-    def route(self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField) -> Route:
+    def route(
+        self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField, now: float = 0.0
+    ) -> Route:
         """The way that `plan` would start from."""
         self.stood(start)
-        return grid_search(self.body, self._explored(sdf), start, goal, self.config.search, self._closed())
+        self._entries = [entry for entry in self._entries if now - entry[0] < self._memory(came=entry[2])]
+        field = self._explored(sdf)
+        route = grid_search(self.body, field, start, goal, self.config.search, self._closed())
+        if not len(route.onward) and not route.reaches_goal and any(came for *_, came in self._entries):
+            # Nothing else is left to try: what came into the way is what to wait for.
+            self._entries = [entry for entry in self._entries if not entry[2]]
+            return grid_search(self.body, field, start, goal, self.config.search, self._closed())
+        return route
 
     def still_good(self, plan: PlanResult, position: Float[Tensor, "2"], sdf: DistanceField) -> bool:
         """Whether what is left of a plan from where the base stands [m] keeps its clearance on a new map."""
@@ -211,11 +234,28 @@ class BasePlanner:
         gaps = (route.path - goal).norm(dim=1)
         return float(gaps[0] - gaps[-1]) < self.config.search.spacing
 
+    def _standing_off(self, route: Route) -> Route:
+        """A route that ends `stand_off` before what came into its way; away from it if it is nearer than that already.
+
+        The first time it stays where it is: what came may walk on at once.
+        """
+        assert route.entry is not None
+        near = (route.path - route.entry).norm(dim=1) < self.config.stand_off
+        if not near[0]:
+            return replace(route, path=route.path[: int(near.float().argmax())] if near.any() else route.path)
+        waited = any((place - route.entry).norm() < self.config.stand_off for _, place, _ in self._entries)
+        if not waited:
+            return replace(route, path=route.path[:1])
+        return replace(route, path=route.grid.way_back(route.path[0], route.entry, self.config.stand_off))
+
+    def _memory(self, came: bool) -> float:
+        return self.config.memory_came if came else self.config.memory
+
     def _closed(self) -> Float[Tensor, "c 2"] | None:
         """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
         if not self._entries:
             return None
-        entries = torch.stack([place for _, place in self._entries])
+        entries = torch.stack([place for _, place, _ in self._entries])
         visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
         return entries[visits >= self.config.looks]
 

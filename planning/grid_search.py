@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -60,6 +60,42 @@ class GridSearchConfig:
 
 
 @dataclass(frozen=True, eq=False)
+class SearchGrid:
+    """Positions and what a metre of way counts there.
+
+    Args:
+        positions: (n, 2) [m].
+        shape: positions along x and y; n is their product.
+        spacing: between neighbours [m].
+        cost: (n,) inf where blocked or unknown.
+    """
+
+    positions: Float[Tensor, "n 2"]
+    shape: tuple[int, int]
+    spacing: float
+    cost: Float[Tensor, "n"]
+
+    @property
+    def free(self) -> Float[Tensor, "f 2"]:
+        """Positions that can be driven through [m]."""
+        return self.positions[torch.isfinite(self.cost)]
+
+    def nearest(self, place: Float[Tensor, "2"]) -> int:
+        """Number of the position closest to a place [m]."""
+        return int((self.positions - place).norm(dim=1).argmin())
+
+    def way_back(
+        self, start: Float[Tensor, "2"], place: Float[Tensor, "2"], distance: float
+    ) -> Float[Tensor, "k 2"]:
+        """The cheapest path [m] from start to where it is `distance` [m] from a place, or else as far as can be."""
+        reach, before = _search(self.cost, self.shape, self.spacing, self.nearest(start))
+        away = (self.positions - place).norm(dim=1).masked_fill(~torch.isfinite(reach), -torch.inf)
+        far = away >= min(distance, float(away.max()))
+        end = int(reach.masked_fill(~far, torch.inf).argmin())
+        return torch.cat([start[None], self.positions[_traced(before, end)][1:]])
+
+
+@dataclass(frozen=True, eq=False)
 class Route:
     """A path over the grid.
 
@@ -69,11 +105,13 @@ class Route:
         reaches_goal: whether it ends at the goal.
         onward: (m, 2) how it would go on to the goal through blocked space [m]; empty where it reaches the goal or no
             such way is left.
+        grid: what it was searched on.
     """
 
     path: Float[Tensor, "k 2"]
     reaches_goal: bool
     onward: Float[Tensor, "m 2"]
+    grid: SearchGrid
 
     @property
     def entry(self) -> Float[Tensor, "2"] | None:
@@ -111,36 +149,41 @@ def grid_search(
         )
     positions, shape = _grid(start, goal, config)
     cost, price = _costs(robot, sdf, positions, start, config)
-    near_start, near_goal = (int((positions - p).norm(dim=1).argmin()) for p in (start, goal))
-    cells, reach = _cheapest(cost, shape, config.spacing, near_start, near_goal)
-    if cells:
-        path = torch.cat([start[None], positions[cells][1:-1], goal[None]])
-        return Route(path, True, path[:0])
+    grid = SearchGrid(positions, shape, config.spacing, cost)
+    near_start, near_goal = grid.nearest(start), grid.nearest(goal)
+    reach, before = _search(cost, shape, config.spacing, near_start)
+    if torch.isfinite(reach[near_goal]):
+        path = torch.cat([start[None], positions[_traced(before, near_goal)][1:-1], goal[None]])
+        return Route(path, True, path[:0], grid)
     if closed is not None and len(closed):
         near = torch.cdist(positions, closed).amin(dim=1) <= config.closed_radius
         price = price.masked_fill(torch.isinf(cost) & near, torch.inf)
-    cells, _ = _cheapest(price, shape, config.spacing, near_start, near_goal)
-    if cells:
+    through, before_through = _search(price, shape, config.spacing, near_start)
+    if torch.isfinite(through[near_goal]):
+        cells = _traced(before_through, near_goal)
         first = int(torch.isinf(cost[cells]).float().argmax())
         path = torch.cat([start[None], positions[cells[1:first]]])
-        return Route(path, False, positions[cells[first:]])
-    gap = (positions - goal).norm(dim=1).masked_fill(~torch.isfinite(torch.as_tensor(reach)), torch.inf)
-    cells, _ = _cheapest(cost, shape, config.spacing, near_start, int(gap.argmin()))
-    return Route(torch.cat([start[None], positions[cells][1:]]), False, positions[:0])
+        return Route(path, False, positions[cells[first:]], grid)
+    gap = (positions - goal).norm(dim=1).masked_fill(~torch.isfinite(reach), torch.inf)
+    cells = _traced(before, int(gap.argmin()))
+    return Route(torch.cat([start[None], positions[cells][1:]]), False, positions[:0], grid)
 
 
-def _cheapest(
-    cost: Float[Tensor, "n"], shape: tuple[int, int], spacing: float, start: int, end: int
-) -> tuple[list[int], Float[ndarray, "n"]]:
-    """Cells of the cheapest path, none if there is no path; and the cost of reaching every cell."""
+def _search(
+    cost: Float[Tensor, "n"], shape: tuple[int, int], spacing: float, start: int
+) -> tuple[Float[Tensor, "n"], Int[ndarray, "n"]]:
+    """What it costs to reach every cell, inf where it cannot be, and the cell before it on the way."""
     graph = _graph(cost.numpy().astype(float), shape, spacing)
     reach, before = dijkstra(graph, indices=start, return_predecessors=True)
-    if not np.isfinite(reach[end]):
-        return [], reach
+    return torch.as_tensor(reach), before
+
+
+def _traced(before: Int[ndarray, "n"], end: int) -> list[int]:
+    """The cells of the way to the last one."""
     cells = [end]
-    while cells[-1] != start:
+    while before[cells[-1]] >= 0:
         cells.append(int(before[cells[-1]]))
-    return cells[::-1], reach
+    return cells[::-1]
 
 
 def _grid(

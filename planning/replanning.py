@@ -46,6 +46,7 @@ class ReplanningConfig:
         scan: angle [rad] turned on the spot at the start, to see what is around.
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
+        wait: the same [s] where something came into the way.
         gaze: where the camera looks.
         extend: a plan that ends before unknown space is made anew when this much [m] less of the way is unknown.
         stuck: the plan is given up when the collision monitor has held the base for this long [s].
@@ -58,6 +59,7 @@ class ReplanningConfig:
     scan: float = 2 * math.pi
     scan_rate: float = 0.5
     retry: float = 1.0
+    wait: float = 2.0
     gaze: GazeConfig = field(default_factory=GazeConfig)
     extend: float = 0.5
     stuck: float = 2.0
@@ -65,10 +67,10 @@ class ReplanningConfig:
     time_limit: float = 180.0
 
     def __post_init__(self) -> None:
-        if not min(self.scan_rate, self.retry, self.extend, self.stuck, self.time_limit) > 0:
+        if not min(self.scan_rate, self.retry, self.wait, self.extend, self.stuck, self.time_limit) > 0:
             raise ConfigError(
-                "ReplanningConfig: scan_rate, retry, extend, stuck and time_limit must be positive, got "
-                f"{self.scan_rate:g} rad/s, {self.retry:g} s, {self.extend:g} m, {self.stuck:g} s and "
+                "ReplanningConfig: scan_rate, retry, wait, extend, stuck and time_limit must be positive, got "
+                f"{self.scan_rate:g} rad/s, {self.retry:g} s, {self.wait:g} s, {self.extend:g} m, {self.stuck:g} s and "
                 f"{self.time_limit:g} s."
             )
 
@@ -117,7 +119,7 @@ class ReplanningLoop:
         self._frame: Any = None
         self._owed = self._held = self._started = 0.0
         self._failures, self._failed_at = 0, np.full(2, math.inf)
-        self._retry_at = -math.inf
+        self._retry_at, self._pause = -math.inf, self.config.retry
         self._to_goal = False
         self._onward = np.empty((0, 2))
         self._mapped = False
@@ -227,7 +229,7 @@ class ReplanningLoop:
         if self.plan is not None and self.planner.still_good(self.plan, start, self.field):
             if self._to_goal:
                 return self.plan
-            route = self.planner.route(start, end, self.field)
+            route = self.planner.route(start, end, self.field, self.robot.time)
             if not self.tracker.finished and not self._leads_on(route):
                 return self.plan
         fresh = self.planner.plan(start, end, self.field, route, self.robot.time)
@@ -239,7 +241,7 @@ class ReplanningLoop:
             self._failures = 0 if gone > PROGRESS else self._failures
             self._to_goal, self.report.message = fresh.reaches_goal, ""
             return fresh.result
-        self._give_up_plan(fresh.reason)
+        self._give_up_plan(fresh.reason, self.config.wait if fresh.came else self.config.retry)
         return None
 
     def _leads_on(self, route: Route) -> bool:
@@ -294,15 +296,17 @@ class ReplanningLoop:
         """Whether the plan was given up because the collision monitor does not let the base follow it."""
         if self.monitor is None or self._held < self.config.stuck:
             return False
-        self._give_up_plan(f"the collision monitor held the base: {self.monitor.interventions.reason}")
+        held = f"the collision monitor held the base: {self.monitor.interventions.reason}"
+        self._give_up_plan(held, self.config.retry)
         return True
 
-    def _give_up_plan(self, reason: str) -> None:
-        """Stand without a plan until it is time for the next attempt."""
+    def _give_up_plan(self, reason: str, pause: float) -> None:
+        """Stand without a plan until it is time for the next attempt, after a pause [s]."""
         self.plan, self._held = None, 0.0
         self._failures += 1
         self._failed_at = self.robot.base_state()[:2]
-        self._retry_at = self.robot.time + self.config.retry
+        self._pause = pause
+        self._retry_at = self.robot.time + pause
         self.report.failed_plans += 1
         self.report.message = reason
         self.report.note(self.robot.time - self._started, reason)
@@ -322,7 +326,7 @@ class ReplanningLoop:
         error = math.remainder(heading - state[2], 2 * math.pi)
         self.gaze.towards(state[:2], heading)
         if abs(error) > FACING:
-            self._retry_at = max(self._retry_at, self.robot.time + duration + self.config.retry)
+            self._retry_at = max(self._retry_at, self.robot.time + duration + self._pause)
         return float(np.clip(error, -self.config.scan_rate, self.config.scan_rate))
 
     def _end(self, status: DriveStatus, message: str) -> None:
