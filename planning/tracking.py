@@ -16,6 +16,9 @@ from planning.unicycle_mpc import MpcWeights, UnicycleMpc
 
 logger = logging.getLogger(__name__)
 
+# A base slower than this [m/s and rad/s], for so many periods in a row, is at rest.
+RESTING, RESTS = np.array([0.005, 0.01]), 3
+
 
 @dataclass(frozen=True)
 class TrackerConfig:
@@ -98,6 +101,7 @@ class BaseTracker:
         self._controller.reset()
         self._turning = False
         self._arrived = False
+        self._rests = 0
         self.finished = False
 
     def command(
@@ -139,8 +143,13 @@ class BaseTracker:
             self.finished = done and not command.any()
             return self._send(command)
         self.finished = False
+        close = error < 5 * config.position_tolerance
+        if self._rests_beside(close and reference.near_end):
+            # No optimum of the horizon leads sideways: turn to the end and drive there.
+            self._reference = reference = self._along(np.stack([state[:2], reference.end]), None)
+            self._turning = True
         heading = wrapped(reference.heading() - float(state[2]))
-        behind = error < 5 * config.position_tolerance and reference.past_end(state[:2])
+        behind = not self._turning and close and reference.past_end(state[:2])
         self._turning = not behind and abs(heading) > (
             config.turn_done if self._turning else config.turn_threshold
         )
@@ -155,12 +164,24 @@ class BaseTracker:
     def _follow(self, path: Float[ndarray, "n 2"], times: Float[ndarray, " n"] | None) -> PathReference:
         key = (path.tobytes(), None if times is None else times.tobytes())
         if self._reference is None or key != self._key:
-            config = self.config
-            # The reference keeps below the limits, so that errors can be made up for.
-            motion = MotionLimits(config.max_speed, 0.7 * config.max_acceleration, 0.7 * config.max_yaw_rate)
-            self._reference = PathReference(path, times, config.cruise_speed, motion)
-            self._key, self._turning, self._arrived = key, False, False
+            self._reference = self._along(path, times)
+            self._key, self._turning, self._arrived, self._rests = key, False, False, 0
         return self._reference
+
+    def _along(self, path: Float[ndarray, "n 2"], times: Float[ndarray, " n"] | None) -> PathReference:
+        config = self.config
+        # The reference keeps below the limits, so that errors can be made up for.
+        motion = MotionLimits(config.max_speed, 0.7 * config.max_acceleration, 0.7 * config.max_yaw_rate)
+        return PathReference(path, times, config.cruise_speed, motion)
+
+    def _rests_beside(self, at_the_end: bool) -> bool:
+        """Whether the base has stood for some periods beside the end of its path, where it has not arrived."""
+        resting = at_the_end and bool((np.abs(self._last) < RESTING).all())
+        self._rests = self._rests + 1 if resting and not self._turning else 0
+        if self._rests < RESTS:
+            return False
+        self._rests = 0
+        return True
 
     def _send(self, command: Float[ndarray, " 2"]) -> tuple[float, float]:
         self._last = command

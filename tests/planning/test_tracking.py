@@ -140,3 +140,26 @@ def test_malformed_input_is_refused(state, path, times, offender):
 def test_bad_settings_are_refused():
     with pytest.raises(ConfigError, match="cruise_speed"):
         TrackerConfig(cruise_speed=2.0)
+
+
+def test_every_short_path_is_driven_to_its_end_however_the_base_stands_beside_it():
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        begin, along = rng.uniform(-0.1, 0.1, 2), rng.uniform(-math.pi, math.pi)
+        path = begin + np.linspace(0, rng.uniform(0.05, 0.6), 20)[:, None] * [
+            math.cos(along),
+            math.sin(along),
+        ]
+        states, _, finished = _drive(path, [0.0, 0.0, rng.uniform(-math.pi, math.pi)])
+        assert finished, f"it stands {np.linalg.norm(states[-1, :2] - path[-1]):.3f} m beside the end"
+        assert np.linalg.norm(states[-1, :2] - path[-1]) < 0.045
+
+
+def test_a_base_that_is_held_before_the_end_does_not_cut_the_corner():
+    tracker, path = BaseTracker(), np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.2]])
+    state = np.array([0.1, 0.0, 0.0])
+    for _ in range(20):  # something is in its way
+        v, omega = tracker.command(state, path)
+        tracker.overruled(0.0, 0.0)
+    assert v > 0 and abs(omega) < 1.0
+    assert tracker._reference.length > 0.4

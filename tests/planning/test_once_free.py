@@ -1,0 +1,101 @@
+"""What comes into the way is told from what was always there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from planning.base_planner import BasePlanner, BasePlannerConfig
+from planning.drive import DriveStatus
+from planning.grid_search import grid_search
+from planning.once_free import OnceFree
+from tests.planning.fields import Box
+from tests.planning.test_replanning import BODY, FREE, QUICK, drive
+from tests.planning.unicycles import Unicycle
+
+START, GOAL = torch.zeros(2), torch.tensor([4.0, 0.0])
+BARRIER = Box((2.0, 0.0, 0.5), (0.3, 30.0, 1.0))
+"""It leaves no way round."""
+
+
+def test_cells_are_remembered_on_both_sides_of_the_origin() -> None:
+    free = OnceFree(0.1)
+    for _ in range(2):
+        free.add(torch.tensor([[-1.32, 2.0], [0.04, -0.04], [3.0, -7.1]]))
+    places = torch.tensor([[-1.3, 1.96], [-0.04, 0.0], [3.0, -7.06], [1.3, 2.0], [0.1, 0.0], [3.0, 7.1]])
+    assert [place in free for place in places] == [True] * 3 + [False] * 3
+
+
+def test_the_way_back_leads_far_enough_and_no_farther() -> None:
+    grid = grid_search(BODY, BARRIER, torch.tensor([1.4, 0.0]), GOAL).grid
+    place = torch.tensor([1.6, 0.0])
+    path = grid.way_back(torch.tensor([1.4, 0.0]), place, 1.0)
+    torch.testing.assert_close(path[0], torch.tensor([1.4, 0.0]))
+    assert 1.0 <= float((path[-1] - place).norm()) < 1.15
+    shut_in = replace(grid, cost=torch.where((grid.positions - path[0]).norm(dim=1) < 0.35, 1.0, torch.inf))
+    nook = shut_in.way_back(path[0], place, 1.0)
+    assert 0.45 < float((nook[-1] - place).norm()) < 0.6, "as far as can be"
+
+
+def test_a_plan_keeps_off_what_came_and_goes_up_to_what_was_there() -> None:
+    was_there = BasePlanner(BODY).plan(START, GOAL, BARRIER)
+    assert was_there.usable and not was_there.came
+    planner = BasePlanner(BODY)
+    assert planner.plan(START, GOAL, FREE).reaches_goal
+    came = planner.plan(START, GOAL, BARRIER, now=1.0)
+    assert came.usable and came.came and not came.reaches_goal
+    gaps = [float((p.onward[0] - p.result.trajectory.waypoints[-1]).norm()) for p in (was_there, came)]
+    assert gaps[0] < 0.2 and 1.0 <= gaps[1] < 1.2
+
+
+def test_too_near_to_what_came_it_waits_and_then_backs_off() -> None:
+    planner, near = BasePlanner(BODY), torch.tensor([1.4, 0.0])
+    planner.plan(near, GOAL, FREE)
+    first, second = (planner.plan(near, GOAL, BARRIER, now=now) for now in (1.0, 3.0))
+    assert first.dead_end and first.came and "came into the way" in first.reason
+    assert second.usable and float(second.result.trajectory.waypoints[-1, 0]) < 0.8
+
+
+def test_what_came_is_waited_for_when_there_is_no_other_way() -> None:
+    shut = Box((2.0, 0.0, 0.5), (0.3, 1000.0, 1.0))
+    planner = BasePlanner(BODY, BasePlannerConfig(looks=1))
+    planner.plan(START, GOAL, FREE)
+    stood = torch.tensor([0.8, 0.0])
+    for now in range(1, 40):
+        plan = planner.plan(stood, GOAL, shut, now=float(now))
+        assert len(plan.onward), "there is always a place to look at"
+
+
+def test_the_robot_waits_for_what_came_and_goes_on_when_it_is_gone() -> None:
+    robot, waited_at = Unicycle(), []
+    shut = Box((2.0, 0.0, 0.5), (0.3, 1000.0, 1.0))
+
+    def knows():
+        there = 3.0 < robot.time < 20.0
+        if 12.0 < robot.time < 20.0:
+            waited_at.append(float(robot.state[0]))
+        return shut if there else FREE
+
+    config = replace(QUICK, planner=BasePlannerConfig(), patience=15, time_limit=90.0)
+    _, report = drive(robot, knows, config, goal=GOAL.double().numpy())
+    assert report.success, report.message
+    assert any("came into the way" in event for event in report.events)
+    assert waited_at and max(waited_at) < 0.8, "as near as it may come"
+    assert robot.time < 40.0
+
+
+def test_what_came_and_stays_is_given_up() -> None:
+    robot = Unicycle()
+    config = replace(QUICK, planner=BasePlannerConfig(), time_limit=200.0)
+    shut = Box((2.0, 0.0, 0.5), (0.3, 1000.0, 1.0))
+    _, report = drive(robot, lambda: shut if robot.time > 6.0 else FREE, config, goal=GOAL.double().numpy())
+    assert report.status is DriveStatus.UNREACHABLE, report.message
+    assert robot.state[0] < 1.0
+
+
+@pytest.mark.parametrize("values", [{"memory_came": 0.0}, {"stand_off": -0.1}])
+def test_bad_ways_of_waiting_are_refused(values: dict) -> None:
+    with pytest.raises(Exception, match=next(iter(values))):
+        BasePlannerConfig(**values)
