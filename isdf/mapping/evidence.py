@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 
 from .nearest import nearest_points
@@ -75,7 +75,7 @@ def look_through(free, corner, spacing, begin, end, depth, appeared, stride, int
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Bounds:
     """Bounds at the nodes of a window of the coarse lattice.
 
     Args:
@@ -84,14 +84,25 @@ class Evidence:
             minus the distance to the closest free node.
         free: looked through.
         unknown: neither looked through nor at a surface.
-        direction: unit vector to the closest surface point.
-        low: height of the lowest surfaces seen [m].
+        nearest: index of the closest surface point.
     """
 
     upper: Float[np.ndarray, "nx ny nz"]
     lower: Float[np.ndarray, "nx ny nz"]
     free: Bool[np.ndarray, "nx ny nz"]
     unknown: Bool[np.ndarray, "nx ny nz"]
+    nearest: Int[np.ndarray, "nx ny nz"]
+
+
+@dataclass(frozen=True)
+class Evidence(Bounds):
+    """The bounds and what else the network goes by.
+
+    Args:
+        direction: unit vector to the closest surface point.
+        height: above the lowest surfaces seen [m].
+    """
+
     direction: Float[np.ndarray, "nx ny nz 3"]
     height: Float[np.ndarray, "nz"]
 
@@ -102,7 +113,7 @@ def gather(
     corner: np.ndarray,
     spacing: float,
 ) -> Evidence:
-    """Bounds from surface points [m] and free evidence.
+    """Bounds from surface points [m] and free evidence, and where the closest of the points lie.
 
     Args:
         seeds: (n, 3) float32 surface points in world coordinates [m]; at least one.
@@ -111,24 +122,35 @@ def gather(
         spacing: of the nodes [m].
     """
     shape = evidence.shape
-    places = (seeds / np.float32(spacing) - corner).astype(np.float32)
-    nearest, square = nearest_points(places, shape, 1)
+    proven = bounds(seeds, evidence, corner, spacing)
+    nodes = np.stack(np.meshgrid(*[np.arange(n, dtype=np.float32) for n in shape], indexing="ij"), axis=-1)
+    reach = np.maximum(proven.upper / np.float32(spacing), 1e-3)
+    direction = (_in_nodes(seeds, corner, spacing)[proven.nearest] - nodes) / reach[..., None]
+    floor = np.partition(seeds[:, 2], len(seeds) // 50)[len(seeds) // 50]
+    height = (spacing * (corner[2] + np.arange(shape[2])) - floor).astype(np.float32)
+    return Evidence(
+        proven.upper, proven.lower, proven.free, proven.unknown, proven.nearest, direction, height
+    )
+
+
+def bounds(
+    seeds: Float[np.ndarray, "n 3"],
+    evidence: UInt8[np.ndarray, "nx ny nz"],
+    corner: np.ndarray,
+    spacing: float,
+) -> Bounds:
+    """The bounds alone; arguments as for `gather`."""
+    everywhere = np.ones(evidence.shape, dtype=np.bool_)
+    nearest, square = nearest_points(_in_nodes(seeds, corner, spacing), everywhere)
     upper = np.sqrt(square)
     free = evidence > FREE_ABOVE
     unknown = ~free & (upper > SURFACE_REACH)
     lower = _lower(free, unknown, upper)
-    nodes = np.stack(np.meshgrid(*[np.arange(n, dtype=np.float32) for n in shape], indexing="ij"), axis=-1)
-    direction = (places[nearest] - nodes) / np.maximum(upper, 1e-3)[..., None]
-    floor = np.partition(seeds[:, 2], len(seeds) // 50)[len(seeds) // 50]
-    height = spacing * (corner[2] + np.arange(shape[2])) - floor
-    return Evidence(
-        upper * np.float32(spacing),
-        lower * np.float32(spacing),
-        free,
-        unknown,
-        direction,
-        height.astype(np.float32),
-    )
+    return Bounds(upper * np.float32(spacing), lower * np.float32(spacing), free, unknown, nearest)
+
+
+def _in_nodes(seeds: np.ndarray, corner: np.ndarray, spacing: float) -> Float[np.ndarray, "n 3"]:
+    return (seeds / np.float32(spacing) - corner).astype(np.float32)
 
 
 def _lower(free: np.ndarray, unknown: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -137,9 +159,9 @@ def _lower(free: np.ndarray, unknown: np.ndarray, upper: np.ndarray) -> np.ndarr
     rim = np.argwhere(_beside(free, unknown)).astype(np.float32)
     if len(exposed) == 0:
         return np.where(free, upper, -upper)
-    # The border runs halfway between a free node and an unknown one.
-    inside = np.sqrt(nearest_points(exposed, free.shape, 1)[1]) - np.float32(0.5)
-    outside = np.sqrt(nearest_points(rim, free.shape, 1)[1]) - np.float32(0.5)
+    # The border runs halfway between a free node and an unknown one, and no way to it leads across it.
+    inside = np.sqrt(nearest_points(exposed, ~unknown)[1]) - np.float32(0.5)
+    outside = np.sqrt(nearest_points(rim, ~free)[1]) - np.float32(0.5)
     # At a surface but not looked through, a node may lie on either side.
     lower = np.where(unknown, -outside, np.where(free, inside, -upper))
     return np.minimum(lower, upper)

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from .bricks import BrickVolume
 from .completion import STRIDE, CompletionNet, features
-from .evidence import gather
+from .evidence import bounds, gather
 from .lattice import Lattice
-from .nearest import nearest_points
+from .nearest import finer_nearest
+from .refinement import cells_to_refine, middle_values, near_known, refined_values
 from .seeds import surface_seeds
-from .values import Patches, Window, cells_to_refine, coarse_values, refined_values
+from .values import Patches, Window, coarse_values
 
 # Surfaces this far outside a window still count in it [m].
 MARGIN = 2.5
@@ -88,18 +89,11 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     centre, normal, weight = surface_seeds(bricks.arrays, *bricks.box(low - MARGIN, high + MARGIN))
     if len(centre) == 0:
         return False
-    ratio = round(lattice.spacing / bricks.voxel)
-    # Nearest seeds are found for every second fine node; the others choose among those around them.
-    half = ratio // 2
-    nx, ny, nz = ((end - begin - 1) * half + 1).tolist()
-    places = (centre / np.float32(2 * bricks.voxel) - (lattice.corner + begin) * half).astype(np.float32)
-    nearest, _ = nearest_points(places, (nx, ny, nz), 1)
-    patches = Patches(centre, normal, weight, PATCH * bricks.voxel, nearest)
     evidence = lattice.read("evidence", begin, end)
-    proven = gather(centre, evidence, lattice.corner + begin, lattice.spacing)
+    proven = bounds(centre, evidence, lattice.corner + begin, lattice.spacing)
     window = Window(
         first=lattice.corner + begin,
-        ratio=ratio,
+        ratio=round(lattice.spacing / bricks.voxel),
         evidence=evidence,
         lower=proven.lower,
         share=lattice.read("share", begin, end).astype(np.float32),
@@ -110,9 +104,15 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
         taken=np.empty(proven.lower.shape, dtype=np.float32),
         block=lattice.read("block", begin, end),
     )
+    # Nearest seeds are found for every second fine node; the others choose among those around them.
+    where = near_known(window, bricks.arrays)
+    places = (centre / np.float32(lattice.spacing / 2) - 2 * window.first).astype(np.float32)
+    nearest = finer_nearest(places, proven.nearest, where)
+    patches = Patches(centre, normal, weight, PATCH * bricks.voxel, nearest)
     coarse_values(window, patches, bricks.arrays)
+    line, miss = middle_values(window, patches, bricks.arrays, where)
     refine, stale = np.zeros_like(window.block, dtype=np.bool_), np.zeros_like(window.block, dtype=np.bool_)
-    cells_to_refine(window, patches, bricks.arrays, lattice.corrections, refine, stale)
+    cells_to_refine(window, line, miss, lattice.corrections, refine, stale)
     # The window's last nodes belong to cells that reach out of it: those stay as they are.
     inner = np.zeros_like(refine)
     inner[:-1, :-1, :-1] = True

@@ -1,0 +1,169 @@
+"""Distances of a window by short cuts, against what they stand for."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
+
+from isdf import Mapper
+from isdf.mapping import refresh
+from isdf.mapping.evidence import FREE, bounds
+from isdf.mapping.lattice import BLOCK, FINE, STEP
+from isdf.mapping.nearest import finer_nearest, nearest_points
+from isdf.mapping.refinement import cells_to_refine, middle_values, near_known, refined_values
+from isdf.mapping.values import nearest_patch
+from tests.isdf.rooms import furnished_orbit
+
+
+@pytest.fixture(scope="module")
+def refreshed():
+    """Arguments of the last `refined_values` of a mapper that saw half of a room: window, patches, bricks."""
+    kept = []
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(
+            refresh, "refined_values", lambda *arguments: kept.append(arguments) or refined_values(*arguments)
+        )
+        mapper = Mapper()
+        for frame in furnished_orbit(16)[:6]:
+            mapper.integrate(frame)
+        mapper.refresh()
+    window, patches, bricks, _, _ = kept[-1]
+    return window, patches, bricks
+
+
+def nodes_of(shape):
+    return np.argwhere(np.ones(shape, dtype=bool))
+
+
+def distances(points, number, nodes):
+    return np.linalg.norm(points[number.ravel()] - nodes, axis=1)
+
+
+def wavy(seed, count=3000):
+    """Points of a surface through a box of 32 x 28 x 24 nodes, and a layer of nodes about it."""
+    rng = np.random.default_rng(seed)
+    across = rng.random((count, 2)) * [31, 27]
+    height = 10 + 4 * np.sin(0.2 * across[:, 0] + seed) + 3 * np.cos(0.3 * across[:, 1])
+    points = np.column_stack([across, height]).astype(np.float32)
+    away = cKDTree(points).query(nodes_of((33, 29, 25)))[0].reshape(33, 29, 25)
+    return points, away, away < 6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_mask_changes_nothing_of_what_is_asked_for(seed):
+    points, away, where = wavy(seed)
+    nodes = nodes_of(where.shape)[where.ravel()]
+    coarse, _ = nearest_points(points / 2, np.ones((17, 15, 13), dtype=bool))
+    masked, square = nearest_points(points, where)
+    everywhere, _ = nearest_points(points, np.ones_like(where))
+    for number in (masked, everywhere, finer_nearest(points, coarse, where)):
+        over = distances(points, number[where], nodes) - away[where]
+        assert over.min() > -1e-4 and over.mean() < 0.03 and np.quantile(over, 0.99) < 0.3
+    np.testing.assert_allclose(
+        np.sqrt(square[where]), distances(points, masked[where], nodes), rtol=1e-4, atol=1e-4
+    )
+    assert (masked == everywhere)[where].mean() > 0.97
+
+
+def test_coarser_nodes_outside_the_mask_keep_their_points():
+    points, away, _ = wavy(0)
+    coarse, _ = nearest_points(points / 2, np.ones((17, 15, 13), dtype=bool))
+    finer = finer_nearest(points, coarse, np.zeros(away.shape, dtype=bool))[::2, ::2, ::2]
+    over = distances(points, finer, 2 * nodes_of(coarse.shape)) - away[::2, ::2, ::2].ravel()
+    assert over.min() > -1e-4 and over.mean() < 0.1
+    assert np.quantile(over[away[::2, ::2, ::2].ravel() < 1], 0.99) < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lower_bounds_are_distances_to_the_border_of_what_was_looked_through(seed):
+    noise = np.random.default_rng(seed).normal(size=(26, 24, 18))
+    free = gaussian_filter(noise, 3) > 0
+    seeds = np.array([[99, 99, 99]], dtype=np.float32)  # so far that it bounds nothing
+    proven = bounds(seeds, np.where(free, FREE, 0).astype(np.uint8), np.zeros(3), 1.0)
+    for these, those, sign in ((free, ~free, 1), (~free, free, -1)):
+        exact = sign * (cKDTree(np.argwhere(those)).query(np.argwhere(these))[0] - 0.5)
+        off = np.abs(proven.lower[these] - exact)
+        assert off.mean() < 4e-3 and off.max() < 0.6
+
+
+def test_only_near_what_is_known_can_a_cell_be_refined(refreshed):
+    window, _, bricks = refreshed
+    where, known = near_known(window, bricks), window.state != 0
+    assert 0.1 < known.mean() < 0.9
+    expected = np.zeros_like(where)
+    for i, j, k in np.argwhere(known):
+        expected[
+            max(0, 2 * i - 2) : 2 * i + 3, max(0, 2 * j - 2) : 2 * j + 3, max(0, 2 * k - 2) : 2 * k + 3
+        ] = 1
+    assert np.array_equal(where, expected)
+
+
+def refinement(window, line, miss, corrections):
+    refine, stale = np.zeros(window.block.shape, dtype=bool), np.zeros(window.block.shape, dtype=bool)
+    cells_to_refine(window, line, miss, corrections, refine, stale)
+    return refine, stale
+
+
+def test_middles_are_interpolated_as_the_field_does(refreshed):
+    window, patches, bricks = refreshed
+    where = near_known(window, bricks)
+    line, miss = middle_values(window, patches, bricks, where)
+    axes = [np.arange(0, 2 * n, 2) for n in window.value.shape]
+    exact = RegularGridInterpolator(axes, window.value)(nodes_of(where.shape)).reshape(where.shape)
+    np.testing.assert_allclose(line[where], exact[where], atol=1e-5)
+    assert (miss[::2, ::2, ::2] == 0).all() and (line[~where] == 0).all()
+
+
+def test_what_is_stored_of_a_cell_is_what_its_middles_miss(refreshed):
+    """Free corners, others, and guesses on both: all are interpolated alike for a check and for what is written."""
+    window, patches, bricks = refreshed
+    line, miss = middle_values(window, patches, bricks, near_known(window, bricks))
+    window = window._replace(block=np.full_like(window.block, -1))
+    corrections = np.zeros((0, BLOCK), dtype=np.int8)
+    refine, stale = refinement(window, line, miss, corrections)
+    cells = np.argwhere(refine)
+    assert len(cells) > 1000 and not stale.any()
+    window.block[refine] = np.arange(len(cells))
+    corrections = np.zeros((len(cells), BLOCK), dtype=np.int8)
+    assert refinement(window, line, miss, corrections)[1][refine].all()
+    refined_values(window, patches, bricks, cells, corrections)
+    again, stale = refinement(window, line, miss, corrections)
+    assert np.array_equal(again, refine) and stale.sum() < 0.01 * len(
+        cells
+    )  # those that miss more than can be stored
+    stored = STEP * corrections.reshape(-1, FINE, FINE, FINE)[:, ::2, ::2, ::2].astype(float)
+    for offset in np.ndindex(3, 3, 3):
+        missed = np.clip(miss[tuple((2 * cells + offset).T)], -127 * STEP, 127 * STEP)
+        assert np.abs(stored[(slice(None), *offset)] - missed).max() < 0.51 * STEP
+
+
+def test_a_mask_changes_nothing_of_what_is_refined(refreshed):
+    window, patches, bricks = refreshed
+    where = near_known(window, bricks)
+    line, miss = middle_values(window, patches, bricks, where)
+    full = middle_values(
+        window, patches._replace(nearest=np.maximum(patches.nearest, 0)), bricks, where | True
+    )
+    window = window._replace(block=np.full_like(window.block, -1))
+    none = np.zeros((0, BLOCK), dtype=np.int8)
+    np.testing.assert_array_equal(refinement(window, line, miss, none)[0], refinement(window, *full, none)[0])
+
+
+def test_the_nearest_patch_is_the_nearest_of_all_about_a_node(refreshed):
+    window, patches, bricks = refreshed
+    places = np.argwhere(near_known(window, bricks)[:-1, :-1, :-1])
+    rng = np.random.default_rng(0)
+    for place in rng.choice(places, 400):
+        at = 2 * place + rng.integers(0, 2, 3)
+        around = patches.nearest[tuple(slice(a // 2, (a + 1) // 2 + 1) for a in at)].ravel()
+        around = around[around >= 0]
+        if len(around) < np.prod(1 + at % 2):
+            continue
+        away = bricks.voxel * (window.first * window.ratio + at) - patches.centre[around]
+        height = (away * patches.normal[around]).sum(axis=1)
+        across = np.sqrt(np.maximum(0, (away**2).sum(axis=1) - height**2)) - patches.radius
+        exact = np.hypot(np.maximum(0, across), height)
+        distance, side, number = nearest_patch(window, patches, bricks.voxel, tuple(at.tolist()))
+        assert distance == pytest.approx(exact.min(), abs=1e-5)
+        assert side == pytest.approx(height[around == number][0], abs=1e-5)
