@@ -96,13 +96,14 @@ def _enter(points, best, square):
 def _sweep(points, best, square, where):
     """A forward and a backward raster pass: each node tries the points of the neighbours that were passed before it.
 
-    That leaves next to no node with a wrong point. Neighbours across a corner would hardly add to that.
+    That leaves next to no node with a wrong point.
     """
     nx, ny, nz = where.shape
     near, least = best.reshape(-1), square.reshape(-1)
     row, layer = nz + 2, (ny + 2) * (nz + 2)
+    # Of the 26 neighbours those that come before: (-1, *, *), (0, -1, *) and (0, 0, -1).
     offsets = np.array(
-        [-layer - row, -layer - 1, -layer, -layer + 1, -layer + row, -row - 1, -row, -row + 1, -1]
+        [-layer + a * row + b for a in (-1, 0, 1) for b in (-1, 0, 1)] + [-row - 1, -row, -row + 1, -1]
     )
     for direction in (1, -1):
         for a in range(nx):
@@ -118,7 +119,7 @@ def _sweep(points, best, square, where):
                     if d <= 1:  # all points that near were offered to it when they entered
                         continue
                     tried = mine
-                    for m in range(9):
+                    for m in range(13):
                         n = near[at + direction * offsets[m]]
                         if n in (tried, mine) or n < 0:
                             continue
