@@ -108,6 +108,22 @@ class Live:
         self.line("plan", np.column_stack([way, np.full(len(way), ABOVE_FLOOR)]))
         self._status = _said(loop)
 
+    def drive_on(self, loop: ReplanningLoop) -> None:
+        """After a drive: drive to wherever somebody drags the goal, until nobody watches any more."""
+        if self.viewer is None or not self.viewer.watched:
+            return
+        print("there: drag the goal to drive on; close the page or press Ctrl-C to end")
+        loop.watch = lambda loop: self.follow(loop, goal_moves=True)
+        try:
+            while self.viewer.watched:
+                goal = self.viewer.controls.take_goal()
+                if goal is None:
+                    time.sleep(0.1)
+                else:
+                    self.say(loop.drive_to(goal).message)
+        except KeyboardInterrupt:
+            pass
+
     def moved_goal(self, goal: np.ndarray) -> np.ndarray:
         """Where somebody has dragged the goal; the same array if nobody has."""
         moved = self.viewer.controls.take_goal() if self.viewer else None

@@ -74,6 +74,7 @@ def main(options: Navigate) -> dict:
     goal = loop.goal  # in the viewer it can be dragged
     report = _report(options, episode, goal, drive, time.perf_counter() - started)
     _write(options, episode, film, loop, report)
+    episode.live.drive_on(loop)
     episode.close()
     return report
 

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ pytest.importorskip("viser")
 
 from examples import grasp
 from examples.episode import Episode, EpisodeOptions
-from examples.live import LiveOptions
+from examples.live import Live, LiveOptions
 from isdf.viewer import Recording, Viewer
 from planning.clock import MeasuredClock
 from planning.replanning import ReplanningConfig, ReplanningLoop
@@ -139,6 +140,29 @@ def test_the_grasps_point_and_ways_are_drawn_for_who_watches(tmp_path) -> None:
     assert len(state.shapes["close map"].faces) > 100
     tool = episode.model.link_poses(q, [episode.model.tool_link])[0, :3, 3]
     assert np.allclose(state.lines["reach"].points, tool.numpy(), atol=1e-3)
+
+
+def test_after_a_drive_the_robot_drives_on_to_where_the_goal_is_dragged() -> None:
+    dragged, driven = [None, np.array([1.0, 2.0]), None, np.array([3.0, 4.0])], []
+
+    class Watched:
+        @property
+        def watched(self) -> bool:
+            return bool(dragged)
+
+        controls = SimpleNamespace(take_goal=lambda: dragged.pop(0))
+
+    def drive_to(goal: np.ndarray) -> SimpleNamespace:
+        driven.append(goal.tolist())
+        return SimpleNamespace(message="the base stands on the goal")
+
+    live = Live(LiveOptions(), SimpleNamespace(), SimpleNamespace(), SimpleNamespace())
+    loop = SimpleNamespace(drive_to=drive_to, watch=None)
+    live.drive_on(loop)
+    assert not driven, "nobody watches"
+    live.viewer = Watched()
+    live.drive_on(loop)
+    assert driven == [[1.0, 2.0], [3.0, 4.0]] and loop.watch is not None
 
 
 def test_dragging_the_goal_in_the_browser_makes_the_loop_plan_to_where_it_was_dropped(tmp_path) -> None:
