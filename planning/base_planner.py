@@ -32,11 +32,11 @@ class BasePlannerConfig:
         margin: clearance [m] that plans keep where the map has a route with as much.
         clearance_change: a plan is no longer good when the map has taken this much [m] of its clearance.
         off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
-        looks: how often the robot stands before blocked space and looks, before it counts as blocked for good.
+        looks: how often the robot stands before blocked space and looks, before it counts as blocked.
         memory: blocked space is given another chance after this long [s], for the world changes.
         memory_came: the same [s] for space that was free before: what came there may go again.
         stand_off: distance [m] to keep from what came into the way, to see all of it down to the floor, and to let it
-            pass.
+            pass; and from other blocked space when it looks at it for the last time.
         room: unknown space this near [m] to the axis of the base, where it was put down, counts as free: a camera on
             the robot does not see the floor round its feet. Later on only the space that the base has been in does.
     """
@@ -157,8 +157,8 @@ class BasePlanner:
         """
         route = route or self.route(start, goal, sdf, now)
         came = route.entry is not None and route.entry in self._once_free
-        if came:
-            route = self._standing_off(route)
+        if route.entry is not None:
+            route = self._to_look_from(route, came)
         result = self._optimised(route, self._explored(sdf))
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
@@ -234,19 +234,26 @@ class BasePlanner:
         gaps = (route.path - goal).norm(dim=1)
         return float(gaps[0] - gaps[-1]) < self.config.search.spacing
 
-    def _standing_off(self, route: Route) -> Route:
-        """A route that ends `stand_off` before what came into its way; away from it if it is nearer than that already.
+    def _to_look_from(self, route: Route, came: bool) -> Route:
+        """The part of a route that leads to where the space that blocks it is best looked at.
 
-        The first time it stays where it is: what came may walk on at once.
+        From close by, since most of what is unknown shows itself on the way there; but the last time from `stand_off`,
+        for close to the robot its camera sees nothing. From what came into the way it stands off anyhow, but waits a
+        moment before it backs off: what came may walk on at once.
         """
         assert route.entry is not None
+        looks = sum(
+            bool((place - route.entry).norm() < self.config.stand_off) for _, place, _ in self._entries
+        )
         near = (route.path - route.entry).norm(dim=1) < self.config.stand_off
-        if not near[0]:
-            return replace(route, path=route.path[: int(near.float().argmax())] if near.any() else route.path)
-        waited = any((place - route.entry).norm() < self.config.stand_off for _, place, _ in self._entries)
-        if not waited:
+        if came and looks == 0 and near[0]:
             return replace(route, path=route.path[:1])
-        return replace(route, path=route.grid.way_back(route.path[0], route.entry, self.config.stand_off))
+        if not came and looks < self.config.looks - 1:
+            return route
+        if near[0]:
+            back = route.grid.way_back(route.path[0], route.entry, self.config.stand_off)
+            return replace(route, path=back)
+        return replace(route, path=route.path[: int(near.float().argmax())] if near.any() else route.path)
 
     def _memory(self, came: bool) -> float:
         return self.config.memory_came if came else self.config.memory

@@ -110,8 +110,10 @@ def test_a_field_that_does_not_tell_is_taken_at_its_word() -> None:
 def test_dead_ends_are_tried_again_after_a_while() -> None:
     planner = BasePlanner(BODY, BasePlannerConfig(memory=30.0))
     wall, goal = Box((0.6, 0.0, 0.5), (0.3, 30.0, 1.0)), torch.tensor([3.0, 0.0])
+    here = START
     for now in range(10):
-        plan = planner.plan(START, goal, wall, now=float(now))
+        plan = planner.plan(here, goal, wall, now=float(now))
+        here = plan.result.trajectory.waypoints[-1] if plan.usable else here
     closed = [
         len(planner.plan(START, goal, wall, now=now).onward) and float(plan.onward[0, 1])
         for now in (10.0, 60.0)
@@ -120,6 +122,24 @@ def test_dead_ends_are_tried_again_after_a_while() -> None:
     again = planner.plan(START, goal, wall, now=200.0).onward
     assert closed[0] != float(fresh[0, 1]), "closed for now"
     torch.testing.assert_close(again, fresh)
+
+
+def test_what_does_not_show_itself_from_close_by_is_looked_at_from_farther_off() -> None:
+    """As space does at the robot's feet: its camera sees it only from some way off."""
+    robot, goal = Unicycle(), np.array([2.0, 0.0])
+    seen = torch.tensor([[-1.5, 0.0], [-0.5, 0.0], [0.5, 0.0]])
+    nearest, found = [math.inf], [False]
+
+    def knows():
+        gap = 2.0 - float(robot.state[0])
+        nearest[0] = min(nearest[0], gap)
+        found[0] = found[0] or (nearest[0] < 1.0 and gap > 1.2)
+        return Observed(FREE, torch.cat([seen, torch.tensor([[2.0, 0.0]])]) if found[0] else seen, 1.1)
+
+    config = replace(QUICK, planner=BasePlannerConfig(), patience=6)
+    _, report = drive(robot, knows, config, goal=goal)
+    assert report.success, report.message
+    assert found[0]
 
 
 def test_the_robot_drives_only_where_it_has_looked_and_still_arrives() -> None:
