@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -106,6 +107,20 @@ class BasePlan:
         return f"{self.result.status.value}: {self.result.message}"
 
 
+class _Look(NamedTuple):
+    """The base stood and looked at blocked space in vain.
+
+    Args:
+        when: [s].
+        place: where blocked space would have been entered, (2,) [m].
+        came: whether it was free before.
+    """
+
+    when: float
+    place: Tensor
+    came: bool
+
+
 class BasePlanner:
     """Plans to a goal, or as near to it as the map allows.
 
@@ -120,7 +135,7 @@ class BasePlanner:
 
     def __init__(self, body: SphereRobot, config: BasePlannerConfig | None = None, seed: int = 0) -> None:
         self.body, self.config, self.seed = body, config or BasePlannerConfig(), seed
-        self._entries: list[tuple[float, Tensor, bool]] = []
+        self._looks: list[_Look] = []
         self._once_free = OnceFree(self.config.search.spacing)
         self._trodden, self._last = Trodden(), torch.full((2,), torch.inf)
         centres, _ = body.spheres(torch.zeros(2))
@@ -128,7 +143,7 @@ class BasePlanner:
 
     def forget(self) -> None:
         """Forget the dead ends, for another goal."""
-        self._entries = []
+        self._looks = []
 
     def stood(self, position: Float[Tensor, "2"]) -> None:
         """Take note that the base has been at a position [m]: space there is free, whether or not it was seen."""
@@ -162,7 +177,7 @@ class BasePlanner:
         result = self._optimised(route, self._explored(sdf))
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
-            self._entries.append((now, route.entry, came))
+            self._looks.append(_Look(now, route.entry, came))
         self._once_free.add(route.grid.free)
         return BasePlan(result, route.reaches_goal, dead_end, route.onward, came)
 
@@ -171,12 +186,12 @@ class BasePlanner:
     ) -> Route:
         """The way that `plan` would start from."""
         self.stood(start)
-        self._entries = [entry for entry in self._entries if now - entry[0] < self._memory(came=entry[2])]
+        self._looks = [look for look in self._looks if now - look.when < self._memory(look)]
         field = self._explored(sdf)
         route = grid_search(self.body, field, start, goal, self.config.search, self._closed())
-        if not len(route.onward) and not route.reaches_goal and any(came for *_, came in self._entries):
+        if not len(route.onward) and not route.reaches_goal and any(look.came for look in self._looks):
             # Nothing else is left to try: what came into the way is what to wait for.
-            self._entries = [entry for entry in self._entries if not entry[2]]
+            self._looks = [look for look in self._looks if not look.came]
             return grid_search(self.body, field, start, goal, self.config.search, self._closed())
         return route
 
@@ -242,27 +257,25 @@ class BasePlanner:
         moment before it backs off: what came may walk on at once.
         """
         assert route.entry is not None
-        looks = sum(
-            bool((place - route.entry).norm() < self.config.stand_off) for _, place, _ in self._entries
-        )
-        near = (route.path - route.entry).norm(dim=1) < self.config.stand_off
+        entry, off = route.entry, self.config.stand_off
+        looks = sum(bool((look.place - entry).norm() < off) for look in self._looks)
+        near = (route.path - entry).norm(dim=1) < off
         if came and looks == 0 and near[0]:
             return replace(route, path=route.path[:1])
         if not came and looks < self.config.looks - 1:
             return route
         if near[0]:
-            back = route.grid.way_back(route.path[0], route.entry, self.config.stand_off)
-            return replace(route, path=back)
+            return replace(route, path=route.grid.way_back(route.path[0], entry, off))
         return replace(route, path=route.path[: int(near.float().argmax())] if near.any() else route.path)
 
-    def _memory(self, came: bool) -> float:
-        return self.config.memory_came if came else self.config.memory
+    def _memory(self, look: _Look) -> float:
+        return self.config.memory_came if look.came else self.config.memory
 
     def _closed(self) -> Float[Tensor, "c 2"] | None:
         """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
-        if not self._entries:
+        if not self._looks:
             return None
-        entries = torch.stack([place for _, place, _ in self._entries])
+        entries = torch.stack([look.place for look in self._looks])
         visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
         return entries[visits >= self.config.looks]
 
