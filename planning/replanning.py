@@ -46,7 +46,7 @@ class ReplanningConfig:
         scan: angle [rad] turned on the spot at the start, to see what is around.
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
-        wait: the same [s] where something came into the way.
+        wait: the same [s] where something came into the way, at most: it goes on as soon as that has gone.
         gaze: where the camera looks.
         extend: a plan that ends before unknown space is made anew when this much [m] less of the way is unknown.
         stuck: the plan is given up when the collision monitor has held the base for this long [s].
@@ -119,7 +119,7 @@ class ReplanningLoop:
         self._frame: Any = None
         self._owed = self._held = self._started = 0.0
         self._failures, self._failed_at = 0, np.full(2, math.inf)
-        self._retry_at, self._pause = -math.inf, self.config.retry
+        self._retry_at, self._came = -math.inf, False
         self._to_goal = False
         self._onward = np.empty((0, 2))
         self._mapped = False
@@ -173,6 +173,10 @@ class ReplanningLoop:
         """Whether there is a plan and it ends at the goal, not only nearer to it."""
         return self.plan is not None and self._to_goal
 
+    @property
+    def _pause(self) -> float:
+        return self.config.wait if self._came else self.config.retry
+
     def _scan(self) -> None:
         """Turn on the spot and map what comes into view."""
         rate, started = self.config.scan_rate, self.robot.time
@@ -207,25 +211,31 @@ class ReplanningLoop:
 
     def _plan_if_needed(self, goal: Float[ndarray, "2"]) -> tuple[PlanResult | None, float]:
         """The plan to follow from now on (None: stand), and the time it took to find out."""
-        if self.plan is None and self.robot.time < self._retry_at:
+        pausing = self.plan is None and self.robot.time < self._retry_at
+        if pausing and not self._came:
             return None, 0.0
         if self.report.frames == 0:
             self.report.message = "the map has had no frame yet"
             return None, 0.0
         plans = self.report.plans
-        plan, spent = self.clock.charge(lambda: self._decide(goal))
+        plan, spent = self.clock.charge(lambda: self._decide(goal, pausing))
         self.report.planning_seconds += spent
         if self.report.plans > plans:
             self.last_planning = spent
             self.report.slowest_plan = max(self.report.slowest_plan, spent)
         return plan, spent
 
-    def _decide(self, goal: Float[ndarray, "2"]) -> PlanResult | None:
-        """Keep the plan while it is good; else make one, to the goal or as near to it as the map allows."""
+    def _decide(self, goal: Float[ndarray, "2"], pausing: bool) -> PlanResult | None:
+        """Keep the plan while it is good; else make one, to the goal or as near to it as the map allows.
+
+        In a pause there is only one if what came into the way has gone.
+        """
         self.field = self.snapshot()
         start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
         end = torch.as_tensor(goal, dtype=torch.float32)
-        route = None
+        route = self.planner.route(start, end, self.field, self.robot.time) if pausing else None
+        if route is not None and not route.reaches_goal:
+            return None
         if self.plan is not None and self.planner.still_good(self.plan, start, self.field):
             if self._to_goal:
                 return self.plan
@@ -241,7 +251,7 @@ class ReplanningLoop:
             self._failures = 0 if gone > PROGRESS else self._failures
             self._to_goal, self.report.message = fresh.reaches_goal, ""
             return fresh.result
-        self._give_up_plan(fresh.reason, self.config.wait if fresh.came else self.config.retry)
+        self._give_up_plan(fresh.reason, fresh.came)
         return None
 
     def _leads_on(self, route: Route) -> bool:
@@ -296,17 +306,16 @@ class ReplanningLoop:
         """Whether the plan was given up because the collision monitor does not let the base follow it."""
         if self.monitor is None or self._held < self.config.stuck:
             return False
-        held = f"the collision monitor held the base: {self.monitor.interventions.reason}"
-        self._give_up_plan(held, self.config.retry)
+        self._give_up_plan(f"the collision monitor held the base: {self.monitor.interventions.reason}")
         return True
 
-    def _give_up_plan(self, reason: str, pause: float) -> None:
-        """Stand without a plan until it is time for the next attempt, after a pause [s]."""
+    def _give_up_plan(self, reason: str, came: bool = False) -> None:
+        """Stand without a plan until it is time for the next attempt."""
         self.plan, self._held = None, 0.0
         self._failures += 1
         self._failed_at = self.robot.base_state()[:2]
-        self._pause = pause
-        self._retry_at = self.robot.time + pause
+        self._came = came
+        self._retry_at = self.robot.time + self._pause
         self.report.failed_plans += 1
         self.report.message = reason
         self.report.note(self.robot.time - self._started, reason)

@@ -86,6 +86,17 @@ def test_the_robot_waits_for_what_came_and_goes_on_when_it_is_gone() -> None:
     assert robot.time < 40.0
 
 
+def test_it_goes_on_as_soon_as_what_came_has_gone() -> None:
+    robot = Unicycle()
+    shut = Box((2.0, 0.0, 0.5), (0.3, 1000.0, 1.0))
+    config = replace(QUICK, planner=BasePlannerConfig(), patience=15, wait=30.0, time_limit=90.0)
+    _, report = drive(
+        robot, lambda: shut if 3.0 < robot.time < 20.0 else FREE, config, goal=GOAL.double().numpy()
+    )
+    assert report.success and any("came into the way" in event for event in report.events)
+    assert robot.time < 33.0
+
+
 def test_what_came_and_stays_is_given_up() -> None:
     robot = Unicycle()
     config = replace(QUICK, planner=BasePlannerConfig(), time_limit=200.0)
