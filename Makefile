@@ -18,7 +18,7 @@ demo: setup      ## a robot maps an unknown room and drives across it: runs/demo
 	$(RUN) -m examples.navigate --out runs/demo --scene apartment --seed 0
 
 test: setup      ## all tests but the slow ones, one process a core
-	$(RUN) -m pytest -n auto --dist loadfile
+	$(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile
 
 test-slow: setup  ## the slow tests
 	$(RUN) -m pytest -m slow
