@@ -84,6 +84,11 @@ class PathReference:
         ahead = np.linspace(self._progress, min(self._progress + LOOK_AHEAD, self.length), 121)
         self._progress = float(ahead[np.linalg.norm(self._at(ahead) - position, axis=1).argmin()])
 
+    def ahead(self, distance: float) -> Float[ndarray, "n 2"]:
+        """The positions [m] that lie more than a distance [m] ahead on the path; at least the last one."""
+        far = np.flatnonzero(self._arc > self._progress + distance)
+        return self._points[far if len(far) else [-1]]
+
     def heading(self) -> float:
         """Direction [rad] of the path where the base is."""
         return float(self._directions(np.array([self._progress]))[0])

@@ -18,6 +18,8 @@ logger = logging.getLogger(__name__)
 
 # A base slower than this [m/s and rad/s], for so many periods in a row, is at rest.
 RESTING, RESTS = np.array([0.005, 0.01]), 3
+# Where it rests it leaves out this much [m] of the path that lies ahead.
+SKIPPED = 0.1
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class BaseTracker:
         self._controller.reset()
         self._turning = False
         self._arrived = False
-        self._rests = 0
+        self._rested = 0
         self.finished = False
 
     def command(
@@ -144,9 +146,9 @@ class BaseTracker:
             return self._send(command)
         self.finished = False
         close = error < 5 * config.position_tolerance
-        if self._rests_beside(close and reference.near_end):
-            # No optimum of the horizon leads sideways: turn to the end and drive there.
-            self._reference = reference = self._along(np.stack([state[:2], reference.end]), None)
+        if self._rests():
+            # No optimum of the horizon leads sideways: turn to what lies ahead and drive there.
+            self._reference = reference = self._along(np.vstack([state[:2], reference.ahead(SKIPPED)]), None)
             self._turning = True
         heading = wrapped(reference.heading() - float(state[2]))
         behind = not self._turning and close and reference.past_end(state[:2])
@@ -160,12 +162,13 @@ class BaseTracker:
     def overruled(self, v: float, omega: float) -> None:
         """Go on from (v [m/s], omega [rad/s]), which was sent in the place of the last command."""
         self._last = np.array([v, omega])
+        self._rested = 0
 
     def _follow(self, path: Float[ndarray, "n 2"], times: Float[ndarray, " n"] | None) -> PathReference:
         key = (path.tobytes(), None if times is None else times.tobytes())
         if self._reference is None or key != self._key:
             self._reference = self._along(path, times)
-            self._key, self._turning, self._arrived, self._rests = key, False, False, 0
+            self._key, self._turning, self._arrived, self._rested = key, False, False, 0
         return self._reference
 
     def _along(self, path: Float[ndarray, "n 2"], times: Float[ndarray, " n"] | None) -> PathReference:
@@ -174,13 +177,13 @@ class BaseTracker:
         motion = MotionLimits(config.max_speed, 0.7 * config.max_acceleration, 0.7 * config.max_yaw_rate)
         return PathReference(path, times, config.cruise_speed, motion)
 
-    def _rests_beside(self, at_the_end: bool) -> bool:
-        """Whether the base has stood for some periods beside the end of its path, where it has not arrived."""
-        resting = at_the_end and bool((np.abs(self._last) < RESTING).all())
-        self._rests = self._rests + 1 if resting and not self._turning else 0
-        if self._rests < RESTS:
+    def _rests(self) -> bool:
+        """Whether the base has stood for some periods, of its own accord, before it has arrived."""
+        resting = not self._turning and bool((np.abs(self._last) < RESTING).all())
+        self._rested = self._rested + 1 if resting else 0
+        if self._rested < RESTS:
             return False
-        self._rests = 0
+        self._rested = 0
         return True
 
     def _send(self, command: Float[ndarray, " 2"]) -> tuple[float, float]:

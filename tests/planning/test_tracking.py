@@ -155,6 +155,18 @@ def test_every_short_path_is_driven_to_its_end_however_the_base_stands_beside_it
         assert np.linalg.norm(states[-1, :2] - path[-1]) < 0.045
 
 
+def test_no_path_is_so_crooked_that_the_base_stands_still_on_it():
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        along, length = rng.uniform(-math.pi, math.pi), rng.uniform(0.3, 1.2)
+        path = np.linspace(0, length, 35)[:, None] * [math.cos(along), math.sin(along)]
+        path = path + rng.normal(0, 0.01, path.shape)
+        states, _, finished = _drive(path, [0.0, 0.0, rng.uniform(-math.pi, math.pi)])
+        assert finished, f"it stands {np.linalg.norm(states[-1, :2] - path[-1]):.3f} m before the end"
+        assert np.linalg.norm(states[-1, :2] - path[-1]) < 0.045
+        assert _lateral(states, path).max() < 0.1
+
+
 def test_a_base_that_is_held_before_the_end_does_not_cut_the_corner():
     tracker, path = BaseTracker(), np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.2]])
     state = np.array([0.1, 0.0, 0.0])
