@@ -107,6 +107,11 @@ class BasePlan:
         return f"{self.result.status.value}: {self.result.message}"
 
 
+# Something has come only where so many positions, into what is blocked now, were free: the edges of walls shift with
+# every image.
+DEEP = 4
+
+
 class _Look(NamedTuple):
     """The base stood and looked at blocked space in vain.
 
@@ -171,14 +176,14 @@ class BasePlanner:
             now: time [s], to know how old a dead end is.
         """
         route = route or self.route(start, goal, sdf, now)
-        came = route.entry is not None and route.entry in self._once_free
+        self._once_free.add(route.grid.free)
+        came = route.entry is not None and bool(self._once_free.were(route.onward[:DEEP]).all())
         if route.entry is not None:
             route = self._to_look_from(route, came)
         result = self._optimised(route, self._explored(sdf))
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
             self._looks.append(_Look(now, route.entry, came))
-        self._once_free.add(route.grid.free)
         return BasePlan(result, route.reaches_goal, dead_end, route.onward, came)
 
     def route(

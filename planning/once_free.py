@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -23,9 +23,9 @@ class OnceFree:
         """Positions [m] are free now."""
         self._cells = np.union1d(self._cells, self._numbers(positions))
 
-    def __contains__(self, position: Float[Tensor, "2"]) -> bool:
-        """Whether a position [m] was free once."""
-        return bool(np.isin(self._numbers(position[None]), self._cells)[0])
+    def were(self, positions: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
+        """Which positions [m] were free once."""
+        return torch.from_numpy(np.isin(self._numbers(positions), self._cells))
 
     def _numbers(self, positions: Float[Tensor, "n 2"]) -> np.ndarray:
         x, y = torch.round(positions / self.spacing).long().numpy().T

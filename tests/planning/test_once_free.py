@@ -25,7 +25,7 @@ def test_cells_are_remembered_on_both_sides_of_the_origin() -> None:
     for _ in range(2):
         free.add(torch.tensor([[-1.32, 2.0], [0.04, -0.04], [3.0, -7.1]]))
     places = torch.tensor([[-1.3, 1.96], [-0.04, 0.0], [3.0, -7.06], [1.3, 2.0], [0.7, 0.0], [3.0, 7.1]])
-    assert [place in free for place in places] == [True] * 3 + [False] * 3
+    assert free.were(places).tolist() == [True] * 3 + [False] * 3
 
 
 def test_the_way_back_leads_far_enough_and_no_farther() -> None:
@@ -48,6 +48,13 @@ def test_a_plan_keeps_off_what_came_and_goes_up_to_what_was_there() -> None:
     assert came.usable and came.came and not came.reaches_goal
     gaps = [float((p.onward[0] - p.result.trajectory.waypoints[-1]).norm()) for p in (was_there, came)]
     assert gaps[0] < 0.2 and 1.0 <= gaps[1] < 1.2
+
+
+def test_a_wall_whose_edge_shifts_has_not_come() -> None:
+    planner = BasePlanner(BODY)
+    for shift in (0.15, 0.0):
+        plan = planner.plan(START, GOAL, Box((2.0 + shift, 0.0, 0.5), (0.3, 30.0, 1.0)))
+    assert not plan.reaches_goal and not plan.came
 
 
 def test_too_near_to_what_came_it_waits_and_then_backs_off() -> None:
