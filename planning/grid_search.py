@@ -34,7 +34,8 @@ class GridSearchConfig:
         through_blocked: how many times longer a way through obstacles counts than a free one, for maps that may be
             wrong about them. Where no free way leads to the goal, the route then follows the cheapest way through
             blocked space up to where that begins, such as a doorway. inf: never.
-        through_unknown: the same for a way through unknown space, on top of what the field's guesses there cost.
+        through_unknown: the same for a way through unknown space, however near to something the field guesses it to
+            be: else the route would lead through a wall that was seen rather than round it.
         closed_radius: blocked space this near [m] to a closed place is never entered.
         workspace: rules for the floor and for unknown space, which counts as blocked.
     """
@@ -223,7 +224,7 @@ def _costs(
     unknown &= ~escape
     price = (1 + (config.caution - 1) * short).masked_fill(solid, config.through_blocked)
     cost = price.masked_fill(solid | unknown, torch.inf)
-    return cost, torch.where(unknown, config.through_unknown * price, price)
+    return cost, price.masked_fill(unknown & ~solid, config.through_unknown)
 
 
 def _clearance_of_a_few(

@@ -103,6 +103,24 @@ def test_the_way_through_unknown_space_has_its_price(price: float, least: float,
     assert torch.equal(route.entry, route.onward[0])
 
 
+def test_the_way_leads_round_a_wall_that_was_seen_however_narrow_unseen_space_is_guessed_to_be() -> None:
+    wall = Box((2.0, 0.0, 0.5), (0.05, 2.0, 1.0))
+
+    class Seen(Confident):
+        def distance(self, points: Tensor) -> Tensor:
+            guess = torch.where(points[..., 0] > 1.2, 0.3, 9.0).to(points)
+            return torch.minimum(wall.distance(points), guess)
+
+        def confidence(self, points: Tensor) -> Tensor:
+            return (points[..., 0] < 1.2).to(points)
+
+    config = BasePlannerConfig().search
+    route = grid_search(BODY, Seen(wall, 0.0), START, torch.tensor([4.0, 0.0]), config)
+    assert not route.reaches_goal
+    way = torch.cat([route.path, route.onward])
+    assert float(wall.distance(torch.cat([way, torch.full((len(way), 1), 0.3)], dim=1)).min()) > 0.1
+
+
 def test_a_field_that_does_not_tell_is_taken_at_its_word() -> None:
     assert BasePlanner(BODY).plan(START, torch.tensor([3.0, 0.0]), FREE).reaches_goal
 
