@@ -144,7 +144,7 @@ def save_picture(path: Path, found: dict[str, Reports]) -> None:
         bars = ax.barh(names, np.nan_to_num(values), color=[f"C{i}" for i in range(len(names))])
         ax.bar_label(bars, [f"{v:{form}}" if np.isfinite(v) else "-" for v in values], padding=2, fontsize=8)
         ax.set_title(title, fontsize=9)
-        ax.margins(x=0.25)
+        ax.set_xlim(0, 1.3 * (np.nan_to_num(values).max() or 1))
     save_small(figure, path, 90)
 
 
