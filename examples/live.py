@@ -112,7 +112,7 @@ class Live:
         """After a drive: drive to wherever somebody drags the goal, until nobody watches any more."""
         if self.viewer is None or not self.viewer.watched:
             return
-        print("there: drag the goal to drive on; close the page or press Ctrl-C to end")
+        print("the drive is over: drag the goal to drive on, close the page or press Ctrl-C to end")
         loop.watch = lambda loop: self.follow(loop, goal_moves=True)
         try:
             while self.viewer.watched:

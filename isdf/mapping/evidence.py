@@ -128,9 +128,7 @@ def gather(
     direction = (_in_nodes(seeds, corner, spacing)[proven.nearest] - nodes) / reach[..., None]
     floor = np.partition(seeds[:, 2], len(seeds) // 50)[len(seeds) // 50]
     height = (spacing * (corner[2] + np.arange(shape[2])) - floor).astype(np.float32)
-    return Evidence(
-        proven.upper, proven.lower, proven.free, proven.unknown, proven.nearest, direction, height
-    )
+    return Evidence(**vars(proven), direction=direction, height=height)
 
 
 def bounds(
