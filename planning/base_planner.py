@@ -178,6 +178,8 @@ class BasePlanner:
             route: the way from start to goal, if it was searched already.
             now: time [s], to know how old a dead end is.
         """
+        self.stood(start)
+        self._looks = [look for look in self._looks if now - look.when < self._memory(look)]
         route = route or self.route(start, goal, sdf, now)
         self._once_free.add(route.grid.free)
         came = route.entry is not None and bool(self._once_free.were(route.onward[:DEEP]).all())
@@ -192,16 +194,8 @@ class BasePlanner:
     def route(
         self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField, now: float = 0.0
     ) -> Route:
-        """The way that `plan` would start from."""
-        self.stood(start)
-        self._looks = [look for look in self._looks if now - look.when < self._memory(look)]
-        field = self._explored(sdf)
-        route = grid_search(self.body, field, start, goal, self.config.search, self._closed())
-        if not len(route.onward) and not route.reaches_goal and any(look.came for look in self._looks):
-            # Nothing else is left to try: what came into the way is what to wait for.
-            self._looks = [look for look in self._looks if not look.came]
-            return grid_search(self.body, field, start, goal, self.config.search, self._closed())
-        return route
+        """The way to the goal, past what stayed blocked when it was looked at."""
+        return grid_search(self.body, self._explored(sdf), start, goal, self.config.search, self._closed(now))
 
     def still_good(self, plan: PlanResult, position: Float[Tensor, "2"], sdf: DistanceField) -> bool:
         """Whether what is left of a plan from where the base stands [m] keeps its clearance on a new map."""
@@ -279,11 +273,12 @@ class BasePlanner:
     def _memory(self, look: _Look) -> float:
         return self.config.memory_came if look.came else self.config.memory
 
-    def _closed(self) -> Float[Tensor, "c 2"] | None:
+    def _closed(self, now: float) -> Float[Tensor, "c 2"] | None:
         """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
-        if not self._looks:
+        places = [look.place for look in self._looks if now - look.when < self._memory(look)]
+        if not places:
             return None
-        entries = torch.stack([look.place for look in self._looks])
+        entries = torch.stack(places)
         visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
         return entries[visits >= self.config.looks]
 

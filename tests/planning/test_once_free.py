@@ -65,16 +65,6 @@ def test_too_near_to_what_came_it_waits_and_then_backs_off() -> None:
     assert second.usable and float(second.result.trajectory.waypoints[-1, 0]) < 0.8
 
 
-def test_what_came_is_waited_for_when_there_is_no_other_way() -> None:
-    shut = Box((2.0, 0.0, 0.5), (0.3, 1000.0, 1.0))
-    planner = BasePlanner(BODY, BasePlannerConfig(looks=1))
-    planner.plan(START, GOAL, FREE)
-    stood = torch.tensor([0.4, 0.0])
-    for now in range(1, 40):
-        plan = planner.plan(stood, GOAL, shut, now=float(now))
-        assert len(plan.onward), "there is always a place to look at"
-
-
 def test_the_robot_waits_for_what_came_and_goes_on_when_it_is_gone() -> None:
     robot, waited_at = Unicycle(), []
     shut = Box((2.0, 0.0, 0.5), (0.3, 1000.0, 1.0))
