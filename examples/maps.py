@@ -60,7 +60,7 @@ def new_map(method: Method, seed: int, world: World) -> OnlineMapper | TrueMap:
         return TrueMap(world)
     untimed = {"first_frame_steps": 0, "steps_per_frame": 0, "keyframe_steps": 0}
     configs: dict[str, Config] = {
-        "default": isdf.MapperConfig(),
+        "default": isdf.MapperConfig(visitors=2.0),
         "isdf": replace(isdf.IsdfConfig(seed=seed), **untimed),
         "voxblox": VoxbloxConfig(),
         "fiesta": FiestaConfig(),

@@ -11,6 +11,7 @@ from .errors import ConfigError
 
 # What a field of each type may hold; numpy's numbers are among them.
 KINDS: dict[str, Any] = {"int": Integral, "float": Real, "bool": bool}
+OPTIONAL = " | None"
 # Whole numbers up to here are exact as floating-point ones.
 LARGEST = 1 << 53
 
@@ -27,8 +28,9 @@ def require_finite(config: Any, unlimited: tuple[str, ...] = ()) -> None:
     """
     for field in dataclasses.fields(config):
         value: Any = getattr(config, field.name)
-        kind = KINDS.get(getattr(field.type, "__name__", str(field.type)))
-        if kind is None:
+        declared = getattr(field.type, "__name__", str(field.type))
+        kind = KINDS.get(declared.removesuffix(OPTIONAL))
+        if kind is None or (value is None and declared.endswith(OPTIONAL)):
             continue
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise ConfigError(f"{field.name} must be of type {field.type}, got {value!r}"[:200])

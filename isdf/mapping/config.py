@@ -24,6 +24,8 @@ class MapperConfig:
         max_weight: of a voxel, in measurements at 1 m: enough to average the noise.
         refresh_period: least frame time between two refreshes of the distances [s].
         guess_period: least frame time between two runs of the network [s].
+        visitors: what came into free space, was not seen to stay and has been out of view for this long [s] is taken
+            back out of the map, for somebody who walks by does not stand where the camera saw him last; None: never.
         max_bricks: a frame that needs a larger table of bricks (of eight voxels a side) is refused.
     """
 
@@ -34,6 +36,7 @@ class MapperConfig:
     max_weight: float = 20.0
     refresh_period: float = 0.3
     guess_period: float = 1.0
+    visitors: float | None = None
     max_bricks: int = 8_000_000
 
     def __post_init__(self) -> None:
@@ -44,6 +47,10 @@ class MapperConfig:
                 "refresh_period",
             ),
         )
+        if self.visitors is not None and not self.visitors > 0:
+            raise ConfigError(
+                f"visitors must be positive, or None for a map that forgets nothing, got {self.visitors} s"
+            )
         for name in ("voxel", "truncation", "max_depth", "max_weight", "max_bricks"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name} must be positive and finite, got {getattr(self, name)}")

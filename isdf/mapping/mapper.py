@@ -31,6 +31,7 @@ from .fusion import fuse, nearest_around
 from .lattice import Lattice
 from .motion import Moment, Motion
 from .refresh import guess, refresh
+from .visitors import Visitors
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +42,8 @@ BEYOND_ACROSS, BEYOND_ALONG = 2.5, 1.5
 # Distances are written anew this far outside what a frame looked at [m].
 MARGIN = 0.8
 # A frame is passed over when more than this share of its points contradicts the map, of those that can be judged by it,
-# which must be this share of all; but no more than so many frames in a row: then the world has changed, not the frame.
+# which must be this share of all, unless its pose is where the motion leads: then somebody stands before the camera.
+# And no more than so many frames in a row: then the world has changed, not the frame.
 CONTRADICTED, JUDGED, PATIENCE = 0.35, 0.25, 5
 # Columns of an image that are compared with the map.
 COLUMNS = 80
@@ -67,6 +69,7 @@ class Mapper(ShownMapper):
         self.config, self.device = config, device
         self.bricks = BrickVolume(self.config.voxel, self.config.max_bricks)
         self.lattice = Lattice(RATIO * self.config.voxel)
+        self.visitors = Visitors(self.bricks, self.lattice, self.config.visitors)
         self.network = load_network().to(self.device)
         self.frames_seen = self.frames_skipped = self.steps = 0
         self.up = np.zeros(3)
@@ -105,7 +108,7 @@ class Mapper(ShownMapper):
         stride = max(1, depth.shape[1] // COLUMNS)
         appeared = self._appeared(depth, T, stride, frame)
         if appeared is None:
-            self._keep_up(frame.time)
+            self._keep_up(T[:3, 3], frame.time)
             return
         box = self._view(depth, T, frame)
         self.bricks.include(box[0], box[1])
@@ -115,6 +118,7 @@ class Mapper(ShownMapper):
         seen = bounds.numpy().astype(float)
         self.lattice.include(np.minimum(seen[0] - beyond, box[0]), np.maximum(seen[1] + beyond, box[1]))
         self._bounds, self.up = bounds, up
+        self.visitors.watch(depth, appeared, stride, _intrinsics(frame), T, frame.time)
         self._fuse(depth, T, frame, box, appeared, stride)
         self._motion.believe(Moment(depth, _intrinsics(frame), T, frame.time))
         self.frames_seen += 1
@@ -123,7 +127,7 @@ class Mapper(ShownMapper):
         if not self._ready or not 0 < frame.time - self._guessed_at < self.config.guess_period:
             self._guess(T[:3, 3])
             self._guessed_at = frame.time
-        self._keep_up(frame.time)
+        self._keep_up(T[:3, 3], frame.time)
 
     def refresh(self) -> None:
         """Bring the distances up to date with all frames so far."""
@@ -216,9 +220,10 @@ class Mapper(ShownMapper):
         appeared, contradicted, judged = compare(
             self.lattice.arrays, self.bricks.arrays, depth, stride, _intrinsics(frame), T
         )
-        away = self._motion.away(Moment(depth, _intrinsics(frame), T, frame.time), stride)
+        moment = Moment(depth, _intrinsics(frame), T, frame.time)
+        away = self._motion.away(moment, stride)
         complaint = ""
-        if judged > JUDGED and contradicted > CONTRADICTED:
+        if judged > JUDGED and contradicted > CONTRADICTED and not self._motion.leads_to(moment):
             complaint = f"{100 * contradicted:.0f} % of the depth image contradict the map"
         elif away is not None:
             complaint = f"the depth image fits the last one {100 * away:.0f} cm from its pose"
@@ -279,9 +284,12 @@ class Mapper(ShownMapper):
         if box is not None:
             self._touch(box)
 
-    def _keep_up(self, now: float) -> None:
+    def _keep_up(self, eye: Float[np.ndarray, "3"], now: float) -> None:
         """Refresh when it is due, whether the newest frame was believed or not."""
         if not self._ready or not 0 < now - self._refreshed_at < self.config.refresh_period:
+            left = self.visitors.take_back(eye, now)
+            if left is not None:
+                refresh(self.lattice, self.bricks, left + np.array([[-MARGIN], [MARGIN]]))
             self.refresh()
             self._refreshed_at = now
 

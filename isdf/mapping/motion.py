@@ -60,16 +60,18 @@ class Motion:
             moment: the new frame.
             stride: every so many pixels is looked at.
         """
-        if self._last is None:
+        if self._last is None or self.leads_to(moment):
             return None
         expected = self._expected(moment.time)
-        if _close(expected, moment.pose):
-            return None
         claimed = self._disagreement(moment, moment.pose, stride)
         other = self._disagreement(moment, expected, stride)
         if claimed is None or other is None or claimed < max(TIMES * other, other + WORSE):
             return None
         return float(np.linalg.norm(expected[:3, 3] - moment.pose[:3, 3]))
+
+    def leads_to(self, moment: Moment) -> bool:
+        """Whether the pose of a frame is where the motion of the last ones leads."""
+        return self._last is not None and _close(self._expected(moment.time), moment.pose)
 
     def _expected(self, when: float) -> Float[np.ndarray, "4 4"]:
         """The pose that the motion between the last two frames leads to."""

@@ -106,6 +106,18 @@ def test_a_thing_put_into_view_is_no_jump(frames):
     assert mapper.frames_skipped == 0
 
 
+def test_somebody_who_steps_before_the_camera_is_no_jump(frames):
+    mapper = Mapper()
+    for frame in frames[:10]:
+        mapper.integrate(frame)
+    eye, at = (-0.8, -1.3, 1.2), (-0.1, -0.7, 0.5)  # as in the last of them
+    for n in range(12):  # across the line of sight, until he hides more than half of what there is to see
+        x, y = -0.45 + 0.03 * (11 - n), -0.95 - 0.04 * (11 - n)
+        room = union(furnished_room(), box((x, y, 0.7), (0.4, 0.4, 1.4)))
+        mapper.integrate(render(room, look_at(eye, (at[0] + 0.01 * (n % 2), *at[1:])), CAMERA, 1.0 + n / FPS))
+    assert mapper.frames_skipped == 0
+
+
 def test_lost_and_black_frames_and_an_image_that_hangs_do_little_harm(frames, points, untroubled, caplog):
     rng, mapper, refused = np.random.default_rng(1), Mapper(), 0
     lost = set(rng.choice(np.arange(1, 28), 3, replace=False).tolist())

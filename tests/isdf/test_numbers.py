@@ -41,12 +41,16 @@ class Plain:
     length: "float" = 1.0
     count: "int" = 1
     exact: "bool" = True
+    period: "float | None" = None
 
 
 @pytest.mark.parametrize(
     "bad",
-    [{"length": None}, {"length": "1"}, {"length": True}, {"count": 1.0}, {"exact": 1}, {"count": None}],
-)
+    [
+        {"length": None}, {"length": "1"}, {"length": True}, {"count": 1.0}, {"exact": 1}, {"count": None},
+        {"period": "1"}, {"period": True},
+    ],
+)  # fmt: skip
 def test_what_is_of_another_type_is_refused(bad) -> None:
     require_finite(Plain(np.float32(2.0), np.int64(3), False))  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=f"{next(iter(bad))} must be of type"):

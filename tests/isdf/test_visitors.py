@@ -1,0 +1,112 @@
+"""Who walks by is taken back out of the map; what stays, and the room itself, is not."""
+
+import functools
+import math
+
+import pytest
+import torch
+
+from isdf import ConfigError, Mapper, MapperConfig, PinholeCamera
+from tests.isdf.rooms import box, furnished_room, look_at, render, union
+
+CAMERA = PinholeCamera.from_fov(64, 48, math.radians(70))
+EYE = (-1.6, -1.5, 1.3)
+THERE, ASIDE = (0.3, 0.2, 0.5), (-1.5, 1.2, 0.5)
+FPS = 5
+
+
+def person(x, y):
+    """Somebody."""
+    return box((x, y, 0.6), (0.3, 0.3, 1.2))
+
+
+def watch(mapper, at, seconds, place=None):
+    """Look at a place for a while; somebody may stand there, or walk if `place` is a function of the share of it."""
+    start = mapper.frames_seen / FPS
+    for n in range(round(seconds * FPS)):
+        where = place(n / (seconds * FPS)) if callable(place) else place
+        room = furnished_room() if where is None else union(furnished_room(), person(*where))
+        # A camera never gives the same image twice.
+        eye = (EYE[0] + 0.02 * (n % 3), *EYE[1:])
+        mapper.integrate(render(room, look_at(eye, at), CAMERA, start + n / FPS))
+
+
+def around(x, y):
+    """Points in and near somebody [m]."""
+    generator = torch.Generator().manual_seed(0)
+    return torch.tensor([x, y, 0.6]) + (torch.rand(300, 3, generator=generator) - 0.5) * torch.tensor(
+        [0.4, 0.4, 1.0]
+    )
+
+
+def walking(share):
+    """Into view and across it, at 0.5 m/s."""
+    return 0.9 - 1.25 * share, -1.0 + 0.4 * share
+
+
+LAST = walking(1.0)
+
+
+@functools.cache
+def mapped(memory):
+    """A map of the room, of somebody who walked through it, and of another corner looked at for long."""
+    mapper = Mapper(MapperConfig(visitors=memory))
+    watch(mapper, THERE, 2.0)
+    before = mapper.field()
+    watch(mapper, THERE, 2.6, walking)
+    mapper.refresh()
+    during = mapper.field()
+    watch(mapper, ASIDE, 3.0, LAST)
+    mapper.refresh()
+    return before, during, mapper.field()
+
+
+def test_who_walks_out_of_view_is_taken_back():
+    before, during, after = mapped(2.0)
+    points = around(*LAST)
+    assert (during.distance(points) < 0.1).float().mean() > 0.5
+    assert (after.distance(points) - before.distance(points)).abs().mean() < 0.02
+    assert (after.observed(points) | ~before.observed(points)).float().mean() > 0.98
+
+
+def test_a_map_that_never_forgets_keeps_it():
+    _, during, after = mapped(None)
+    points = around(*LAST)
+    assert (after.distance(points) - during.distance(points)).abs().mean() < 0.02
+
+
+def test_the_room_stays_as_it_was():
+    before, _, after = mapped(2.0)
+    points = (torch.rand(4000, 3, generator=torch.Generator().manual_seed(1)) - 0.5) * torch.tensor(
+        [3.6, 3.6, 2.0]
+    )
+    points = points + torch.tensor([0.0, 0.0, 1.0])
+    truth = furnished_room()(points)
+    seen = before.observed(points) & (truth > 0)
+    errors = [(field.distance(points[seen]) - truth[seen]).abs().mean() for field in (before, after)]
+    assert errors[1] < 1.1 * errors[0]
+
+
+def test_what_is_seen_to_stay_is_kept():
+    mapper = Mapper(MapperConfig(visitors=2.0))
+    watch(mapper, THERE, 2.0)
+    watch(mapper, THERE, 6.0, LAST)
+    during = mapper.field()
+    watch(mapper, ASIDE, 4.0, LAST)
+    points = around(*LAST)
+    assert (mapper.field().distance(points) - during.distance(points)).abs().mean() < 0.02
+
+
+def test_what_was_never_seen_free_is_no_visitor():
+    mapper = Mapper(MapperConfig(visitors=2.0))
+    watch(mapper, THERE, 1.0, LAST)
+    during = mapper.field()
+    watch(mapper, ASIDE, 4.0, LAST)
+    points = around(*LAST)
+    assert (mapper.field().distance(points) - during.distance(points)).abs().mean() < 0.02
+
+
+@pytest.mark.parametrize("memory", [0.0, -1.0, math.nan, math.inf])
+def test_memories_that_are_none_are_refused(memory):
+    with pytest.raises(ConfigError, match="visitors"):
+        MapperConfig(visitors=memory)
