@@ -18,6 +18,8 @@ T = TypeVar("T")
 
 # A path shorter than this [m] is at its end: what counts is what lies ahead.
 AT_THE_END = 0.5
+# The camera looks at what is within this angle of the way the base faces [rad].
+FACING = 0.3
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,29 @@ class Gaze:
         distance, height = self._nod([(self.config.near, 0.0), *far])
         place = position + distance * np.array([math.cos(heading), math.sin(heading)])
         self.robot.look_at(np.array([*place, height]))
+
+    def onward(
+        self, way: Float[ndarray, "n 2"], state: Float[ndarray, "3"], rate: float
+    ) -> tuple[float, bool]:
+        """Look along where a way [m] would go on, if there is one, and else ahead while the base turns.
+
+        Args:
+            way: positions; those nearer than `near` do not count.
+            state: x, y [m], yaw [rad] of the base.
+            rate: of turning [rad/s].
+
+        Returns:
+            How fast to turn [rad/s], and whether the camera looks there already; around it always does.
+        """
+        far = way[np.linalg.norm(way - state[:2], axis=1) > self.config.near]
+        if len(far) == 0:
+            self.towards(state[:2], float(state[2]))
+            return rate, True
+        away = far[0] - state[:2]
+        heading = math.atan2(away[1], away[0])
+        error = math.remainder(heading - state[2], 2 * math.pi)
+        self.towards(state[:2], heading)
+        return float(np.clip(error, -rate, rate)), abs(error) <= FACING
 
     def _nod(self, between: Sequence[T]) -> T:
         """One of the things to look at in turn."""

@@ -23,6 +23,7 @@ from planning.collision_monitor import CollisionMonitor
 from planning.drive import DriveReport, DriveStatus, MobileRobot
 from planning.errors import ConfigError
 from planning.gaze import Gaze, GazeConfig
+from planning.giving_way import GivingWay, length_left, path_length
 from planning.grid_search import Route
 from planning.protocols import DistanceField, SphereRobot
 from planning.result import PlanResult
@@ -32,8 +33,6 @@ logger = logging.getLogger(__name__)
 
 # The base has made progress since a failure when it is this far from where it stood then [m].
 PROGRESS = 0.1
-# The camera looks at what is within this angle of the way it faces [rad].
-FACING = 0.3
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,8 @@ class ReplanningConfig:
         scan_rate: speed of that turn [rad/s]; slow enough for the map to learn what comes into view.
         retry: after a failed plan the robot turns and maps for this long [s] before the next attempt.
         wait: the same [s] where something came into the way, at most: it goes on as soon as that has gone.
+        detour: where the way round what came is longer by more than this [m], the robot first stands and lets it pass,
+            for `wait` at most.
         gaze: where the camera looks.
         extend: a plan that ends before unknown space is made anew when this much [m] less of the way is unknown.
         stuck: the plan is given up when the collision monitor has held the base for this long [s].
@@ -60,6 +61,7 @@ class ReplanningConfig:
     scan_rate: float = 0.5
     retry: float = 1.0
     wait: float = 2.0
+    detour: float = 0.5
     gaze: GazeConfig = field(default_factory=GazeConfig)
     extend: float = 0.5
     stuck: float = 2.0
@@ -67,12 +69,11 @@ class ReplanningConfig:
     time_limit: float = 180.0
 
     def __post_init__(self) -> None:
-        if not min(self.scan_rate, self.retry, self.wait, self.extend, self.stuck, self.time_limit) > 0:
-            raise ConfigError(
-                "ReplanningConfig: scan_rate, retry, wait, extend, stuck and time_limit must be positive, got "
-                f"{self.scan_rate:g} rad/s, {self.retry:g} s, {self.wait:g} s, {self.extend:g} m, {self.stuck:g} s and "
-                f"{self.time_limit:g} s."
-            )
+        positive = ("scan_rate", "retry", "wait", "detour", "extend", "stuck", "time_limit")
+        values = [getattr(self, name) for name in positive]
+        if not min(values) > 0:
+            got = ", ".join(f"{name} {value:g}" for name, value in zip(positive, values, strict=True))
+            raise ConfigError(f"ReplanningConfig: these must be positive: {got}.")
 
 
 class ReplanningLoop:
@@ -111,6 +112,7 @@ class ReplanningLoop:
         self.planner = BasePlanner(body, self.config.planner, seed)
         self.tracker = BaseTracker(self.config.tracker)
         self.gaze = Gaze(robot, self.config.gaze)
+        self.giving_way = GivingWay(self.config.wait, self.config.detour)
         self.plan: PlanResult | None = None
         self.field: DistanceField | None = None
         self.report = DriveReport()
@@ -131,11 +133,9 @@ class ReplanningLoop:
             goal: x, y [m].
             final_yaw: heading to end with [rad]; any if None.
         """
-        started, self.report, self.plan = self.robot.time, DriveReport(), None
-        self.goal, self._started = np.array(goal, dtype=float), started
-        self._failures, self._retry_at, self._to_goal, self._held = 0, -math.inf, False, 0.0
-        self._onward = self._onward[:0]
-        self.planner.forget()
+        started = self._started = self.robot.time
+        self.report = DriveReport()
+        self._head_for(goal)
         self._scan()
         self.tracker.reset()
         while self.robot.time - started < self.config.time_limit:
@@ -163,10 +163,15 @@ class ReplanningLoop:
 
     def change_goal(self, goal: Float[ndarray, "2"]) -> None:
         """Drive to another goal x, y [m] from the next round on; for `watch` to call while a drive goes on."""
+        self._head_for(goal)
+        self.report.note(self.robot.time - self._started, f"the goal is now {goal[0]:.2f}, {goal[1]:.2f}")
+
+    def _head_for(self, goal: Float[ndarray, "2"]) -> None:
+        """Begin anew."""
         self.goal, self.plan, self._to_goal = np.array(goal, dtype=float), None, False
         self._failures, self._retry_at, self._held, self._onward = 0, -math.inf, 0.0, self._onward[:0]
+        self.giving_way.end()
         self.planner.forget()
-        self.report.note(self.robot.time - self._started, f"the goal is now {goal[0]:.2f}, {goal[1]:.2f}")
 
     @property
     def leads_to_goal(self) -> bool:
@@ -236,12 +241,17 @@ class ReplanningLoop:
         route = self.planner.route(start, end, self.field, self.robot.time) if pausing else None
         if route is not None and not route.reaches_goal:
             return None
-        if self.plan is not None and self.planner.still_good(self.plan, start, self.field):
-            if self._to_goal:
-                return self.plan
-            route = self.planner.route(start, end, self.field, self.robot.time)
-            if not self.tracker.finished and not self._leads_on(route):
-                return self.plan
+        plan = self.plan or self.giving_way.plan
+        if plan is not None:
+            good = self.planner.still_good(plan, start, self.field)
+            if good and self._to_goal:
+                return plan
+            route = route or self.planner.route(start, end, self.field, self.robot.time)
+            if good and not self.tracker.finished and not self._leads_on(route):
+                return plan
+            if not good and self._lets_pass(plan, route):
+                return None
+        self.giving_way.end()
         fresh = self.planner.plan(start, end, self.field, route, self.robot.time)
         self.report.plans += 1
         self._onward = fresh.onward.numpy().astype(float)
@@ -254,22 +264,32 @@ class ReplanningLoop:
         self._give_up_plan(fresh.reason, fresh.came)
         return None
 
+    def _lets_pass(self, plan: PlanResult, route: Route) -> bool:
+        """Whether to wait for a plan that is blocked rather than take another route."""
+        here, path = self.robot.base_state()[:2], plan.trajectory.waypoints.numpy().astype(float)
+        left = length_left(path, here) + path_length(self._onward)
+        way_round = path_length(route.path.numpy()) + path_length(route.onward.numpy())
+        return self.giving_way.waits(plan, left, way_round, self.robot.time)
+
     def _leads_on(self, route: Route) -> bool:
         """Whether a route leaves less of the way unknown than the plan that is followed, which ends before the goal."""
-        left = _length(self._onward) - _length(route.onward.numpy().astype(float))
+        left = path_length(self._onward) - path_length(route.onward.numpy())
         return route.reaches_goal or left > self.config.extend
 
     def _follow(self, duration: float, final_yaw: float | None) -> None:
         """Let time pass on the plan; without one, turn on the spot to see more."""
-        if self.plan is None:
-            turn = self._turn_onward(self.robot.base_state(), duration)
+        plan = self.plan or self.giving_way.plan
+        if plan is None:
+            turn, faces = self.gaze.onward(self._onward, self.robot.base_state(), self.config.scan_rate)
+            if not faces:  # the next attempt waits until the camera has looked that way
+                self._retry_at = max(self._retry_at, self.robot.time + duration + self._pause)
             self._pass_time(duration, lambda _: (0.0, turn))
             return
-        path = self.plan.trajectory.waypoints.numpy().astype(float)
+        path = plan.trajectory.waypoints.numpy().astype(float)
 
         def command(state: ndarray) -> tuple[float, float]:
             self.gaze.along(path, state)
-            return self.tracker.command(state, path, None, final_yaw)
+            return self.tracker.command(state, path, None, final_yaw) if self.plan else (0.0, 0.0)
 
         self._pass_time(duration, command)
 
@@ -312,6 +332,7 @@ class ReplanningLoop:
     def _give_up_plan(self, reason: str, came: bool = False) -> None:
         """Stand without a plan until it is time for the next attempt."""
         self.plan, self._held = None, 0.0
+        self.giving_way.end()
         self._failures += 1
         self._failed_at = self.robot.base_state()[:2]
         self._came = came
@@ -321,28 +342,6 @@ class ReplanningLoop:
         self.report.note(self.robot.time - self._started, reason)
         logger.info("no plan: %s", reason)
 
-    def _turn_onward(self, state: ndarray, duration: float) -> float:
-        """Look along where the way would go on, if there is one, and else around; returns the turning rate.
-
-        The next attempt waits until the camera has faced that way; turning goes on for `duration` [s].
-        """
-        far = self._onward[np.linalg.norm(self._onward - state[:2], axis=1) > self.config.gaze.near]
-        if len(far) == 0:
-            self.gaze.towards(state[:2], state[2])
-            return self.config.scan_rate
-        away = far[0] - state[:2]
-        heading = math.atan2(away[1], away[0])
-        error = math.remainder(heading - state[2], 2 * math.pi)
-        self.gaze.towards(state[:2], heading)
-        if abs(error) > FACING:
-            self._retry_at = max(self._retry_at, self.robot.time + duration + self._pause)
-        return float(np.clip(error, -self.config.scan_rate, self.config.scan_rate))
-
     def _end(self, status: DriveStatus, message: str) -> None:
         self.report.status, self.report.message = status, message
         logger.info("drive ended: %s (%s)", status.value, message)
-
-
-def _length(path: Float[ndarray, "n 2"]) -> float:
-    """Length of a polyline [m]."""
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
