@@ -256,11 +256,13 @@ class BasePlanner:
 
         From close by, since most of what is unknown shows itself on the way there; but the last time from `stand_off`,
         for close to the robot its camera sees nothing. From what came into the way it stands off anyhow, but waits a
-        moment before it backs off: what came may walk on at once.
+        moment before it backs off: what came may walk on at once. What does not may find no room to: then it backs off
+        twice as far.
         """
         assert route.entry is not None
         entry, off = route.entry, self.config.stand_off
         looks = sum(bool((look.place - entry).norm() < off) for look in self._looks)
+        off *= 2 if came and looks > 1 else 1
         near = (route.path - entry).norm(dim=1) < off
         if came and looks == 0 and near[0]:
             return replace(route, path=route.path[:1])

@@ -63,6 +63,10 @@ def test_too_near_to_what_came_it_waits_and_then_backs_off() -> None:
     first, second = (planner.plan(near, GOAL, BARRIER, now=now) for now in (1.0, 3.0))
     assert first.dead_end and first.came and "came into the way" in first.reason
     assert second.usable and float(second.result.trajectory.waypoints[-1, 0]) < 0.8
+    there = second.result.trajectory.waypoints[-1]
+    third, fourth = (planner.plan(there, GOAL, BARRIER, now=now) for now in (5.0, 7.0))
+    assert third.dead_end, "it stands far enough, and looks"
+    assert fourth.usable and -0.6 < float(fourth.result.trajectory.waypoints[-1, 0]) < -0.4
 
 
 def test_the_robot_waits_for_what_came_and_goes_on_when_it_is_gone() -> None:
