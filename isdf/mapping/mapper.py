@@ -304,11 +304,14 @@ def compile_kernels() -> None:
     """Compile everything that runs later, so that no frame waits for it."""
     camera = PinholeCamera(12.0, 12.0, 7.5, 5.5, 16, 12)
     mapper = object.__new__(Mapper)
-    mapper._begin(MapperConfig(), torch.device("cpu"))
+    mapper._begin(MapperConfig(visitors=1.0), torch.device("cpu"))
     for index in range(2):
         depth = torch.full((12, 16), 1.0 + 0.01 * index)
         depth[4:8, 4:8] -= 0.3
-        mapper.integrate(DepthFrame(depth, torch.eye(4), camera, time=float(2 * index)))
+        frame = DepthFrame(depth, torch.eye(4), camera, time=float(2 * index))
+        mapper.integrate(frame)
+    anywhere, T = np.ones((12, 16), dtype=bool), frame.T_world_camera.numpy()
+    mapper.visitors.watch(depth.numpy(), anywhere, 1, _intrinsics(frame), T, frame.time)
     field = mapper.field()
     for dtype in (torch.float32, torch.float64):
         field.distance_and_gradient(torch.zeros(1, 3, dtype=dtype))
