@@ -1,11 +1,12 @@
 """Memory and time a frame of the default map as it grows from a room to a house and to a long corridor of rooms.
 
-    ISDF_DATA_DIR=... python -m benchmarks.large_spaces --out runs/large_spaces
+    ISDF_DATA_DIR=... python -m benchmarks.large_spaces --out runs/large_spaces --publish docs/results.md
 
 A camera looks around once at every spot of each place, one spot after the other, and a snapshot of the field is taken
 with every frame and kept until the next, as a planner does. The house (19 x 11 m) is read from
 `aws_small_house/small_house_visual_world.ply` in ISDF_DATA_DIR and left out where that is not set. Left behind:
-`large_spaces.json` with a row a spot, and `large_spaces.png`.
+`large_spaces.json` with a row a spot, and `large_spaces.png`; with --publish the table and the picture also take their
+places in a Markdown page.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,6 +26,11 @@ import tyro
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+if not __package__:  # run as a file
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.publishing import publish
+from benchmarks.tables import markdown
 from isdf import DepthFrame, Mapper, PinholeCamera
 from isdf.evaluation.figures import save_small
 from robots.simulation.poses import looking
@@ -50,6 +57,8 @@ class LargeSpaces:
     """Of the corridor [m]."""
     seed: int = 0
     """Of the corridor's furniture and the house's spots."""
+    publish: Path | None = None
+    """A Markdown page with places for the table and the picture."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +99,31 @@ def main(options: LargeSpaces) -> None:
     for name in sorted(places, key=["room", "house", "corridor"].index):
         mesh, spots = places[name]
         rows += mapped(name, RayCaster(mesh), spots)
-        half = [r for r in rows if r.place == name][len(spots) // 2 :]
-        print(
-            f"{name}: {len(spots)} spots, {rows[-1].volume:.0f} m^3, state {rows[-1].state:.1f} MB, query "
-            f"{rows[-1].query:.1f} MB, {np.mean([r.frame for r in half]):.1f} ms a frame in the second half, of that "
-            f"the snapshot {np.mean([r.snapshot for r in half]):.2f} ms",
-            flush=True,
-        )
+        print(f"{name}: mapped", flush=True)
         (options.out / "large_spaces.json").write_text(json.dumps([asdict(row) for row in rows], indent=1))
         plot(options.out / "large_spaces.png", rows)
+    text = table(rows)
+    print(text)
+    if options.publish:
+        publish(options.publish, {"large": text}, [options.out / "large_spaces.png"])
+
+
+def table(rows: list[Row]) -> str:
+    """A line a place."""
+    head = [
+        "place", "looked through [m^3]", "state [MB]", "of that to query [MB]", "a frame, first half [ms]",
+        "second half [ms]", "of that the snapshot [ms]",
+    ]  # fmt: skip
+    lines = []
+    for place in dict.fromkeys(row.place for row in rows):
+        here = [row for row in rows if row.place == place]
+        halves = here[: len(here) // 2], here[len(here) // 2 :]
+        frames = [f"{np.mean([row.frame for row in half]):.0f}" for half in halves]
+        end, snapshot = here[-1], np.mean([row.snapshot for row in halves[1]])
+        lines.append(
+            [place, f"{end.volume:.0f}", f"{end.state:.0f}", f"{end.query:.1f}", *frames, f"{snapshot:.2f}"]
+        )
+    return markdown(head, lines)
 
 
 def mapped(name: str, rays: RayCaster, spots: Float[np.ndarray, "n 3"]) -> list[Row]:
