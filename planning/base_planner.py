@@ -255,18 +255,17 @@ class BasePlanner:
         """The part of a route that leads to where the space that blocks it is best looked at.
 
         From close by, since most of what is unknown shows itself on the way there; but the last time from `stand_off`,
-        for close to the robot its camera sees nothing. From what came into the way it stands off anyhow, but waits a
-        moment before it backs off: what came may walk on at once. What does not may find no room to: then it backs off
-        twice as far.
+        for close to the robot its camera sees nothing. From what came into the way it stands off anyhow, but backs off
+        only for the last time: what came may walk on at once, and who backs off has to turn away and back again.
         """
         assert route.entry is not None
         entry, off = route.entry, self.config.stand_off
         looks = sum(bool((look.place - entry).norm() < off) for look in self._looks)
-        off *= 2 if came and looks > 1 else 1
         near = (route.path - entry).norm(dim=1) < off
-        if came and looks == 0 and near[0]:
+        last = looks >= self.config.looks - 1
+        if came and near[0] and not last:
             return replace(route, path=route.path[:1])
-        if not came and looks < self.config.looks - 1:
+        if not came and not last:
             return route
         if near[0]:
             return replace(route, path=route.grid.way_back(route.path[0], entry, off))
