@@ -3,10 +3,14 @@
 import functools
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from isdf import ConfigError, Mapper, MapperConfig, PinholeCamera
+from isdf.mapping.bricks import BrickVolume
+from isdf.mapping.lattice import Lattice
+from isdf.mapping.visitors import Visitors
 from tests.isdf.rooms import box, furnished_room, look_at, render, union
 
 CAMERA = PinholeCamera.from_fov(64, 48, math.radians(70))
@@ -110,3 +114,23 @@ def test_what_was_never_seen_free_is_no_visitor():
 def test_memories_that_are_none_are_refused(memory):
     with pytest.raises(ConfigError, match="visitors"):
         MapperConfig(visitors=memory)
+
+
+@pytest.mark.parametrize("first", [0.0, math.inf])
+def test_only_bricks_that_something_came_into_are_given_back(first):
+    bricks, lattice = BrickVolume(0.04, 100_000), Lattice(0.16)
+    for volume in (bricks, lattice):
+        volume.include(np.zeros(3), np.ones(3))
+    place = np.array([[1, 1, 1]])
+    bricks.add(place - bricks.corner)
+    visitors = Visitors(bricks, lattice, memory=2.0)
+    visitors._kept = visitors._copied(place, 1.0)._replace(first=np.array([first]))
+    bricks.weight[0], bricks.distance[0] = 1.0, 0.02  # a surface
+    box = visitors.take_back(np.array([9.0, 0.0, 0.0]), 2.9)
+    assert box is None, "not yet"
+    box = visitors.take_back(np.array([9.0, 0.0, 0.0]), 3.1)
+    if math.isinf(first):
+        assert box is None and (bricks.weight[0] == 1).all()
+    else:
+        np.testing.assert_allclose(box, [[0.32] * 3, [0.64] * 3])
+        assert (bricks.weight[0] == 0).all()
