@@ -12,7 +12,8 @@ information was not yet in the field [s] (95th percentile and greatest), million
 gradient on two cores of the field and of the baked one, and what baking adds to the error [cm].
 
 Then the default map's figures beside their targets, and its CPU time a frame by stage. All of it goes to
-`realtime.json` in `--out`, and how true the confidence is to `reliability.png`.
+`realtime.json` in `--out`, and how true the confidence is to `reliability.png`; with `--publish` the table and that
+picture also take their places in a Markdown page.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from torch import Tensor
 if not __package__:  # run as a file
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.realtime_report import Reliability, save_reliability, target_lines
+from benchmarks.publishing import publish
+from benchmarks.realtime_report import Reliability, save_reliability, table, target_lines
 from benchmarks.stages import map_stages
 from isdf import IsdfConfig, MapperConfig
 from isdf.datasets import DepthSequence, open_sequence
@@ -74,6 +76,8 @@ class Realtime:
     """Sequence time between evaluations [s]."""
     cpu_per_second: float = 1.0
     """CPU seconds allowed for each second of sequence."""
+    publish: Path | None = None
+    """A Markdown page with places for the table and the picture."""
 
 
 @dataclass
@@ -214,6 +218,8 @@ def main(options: Realtime) -> None:
         stages = map_stages(judge.sequence)
         print("\nCPU time of a frame [ms]: " + ", ".join(f"{k} {v:.1f}" for k, v in stages.items()))
         (options.out / "stages.json").write_text(json.dumps(stages, indent=1))
+    if options.publish:
+        publish(options.publish, {"realtime": table(rows)}, [options.out / "reliability.png"])
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from benchmarks.tables import NAMES, markdown
 from isdf.evaluation import roc_area
 from isdf.evaluation.figures import save_small
 from isdf.evaluation.metrics import UNSAFE
@@ -26,6 +27,39 @@ EVERYWHERE = {"MB": 5.0, "age": 0.5, "CPU": 1.0}
 # Of the field 300,000 queries a second; of it or the baked one, whichever is faster, 3 million.
 LEAST = {"auc": 0.9, "M/s": 0.3, "baked": 3.0}
 BINS = 10
+
+
+# Columns of the table, with the factor and the digits they are shown with.
+SHOWN: dict[str, tuple[str, float, int]] = {
+    "end": ("SDF error [cm], end", 1, 2),
+    "mean": ("mean over time", 1, 2),
+    "near": ("below 0.3 m", 1, 2),
+    "unseen": ("unseen", 1, 1),
+    "1-cos": ("gradient 1-cos", 1, 3),
+    "cost": ("cost error [cm]", 100, 2),
+    "over": ("over by > 5 cm [%]", 100, 1),
+    "auc": ("confidence, ROC area", 1, 3),
+    "CPU": ("CPU s a second", 1, 2),
+    "age": ("age, greatest [s]", 1, 2),
+    "MB": ("field [MB]", 1, 1),
+}
+
+
+def table(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    """A line a sequence and method, in Markdown.
+
+    Args:
+        rows: sequence -> method -> column -> value.
+    """
+    lines = []
+    for name, methods in rows.items():
+        for method, row in methods.items():
+            cells = [
+                "-" if row[column] is None else f"{factor * row[column]:.{digits}f}"
+                for column, (_, factor, digits) in SHOWN.items()
+            ]
+            lines.append([f"{name}, {NAMES[method]}", *cells])
+    return markdown(["sequence and map", *(head for head, _, _ in SHOWN.values())], lines)
 
 
 def target_lines(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
