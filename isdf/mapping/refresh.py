@@ -63,7 +63,11 @@ def surroundings(
     reach = np.full(3, min(GUESS_ACROSS, NODES_ACROSS * lattice.spacing))
     reach[vertical] = min(GUESS_ALONG, NODES_ALONG * lattice.spacing)
     begin, end = lattice.window(eye - reach, eye + reach)
-    end = begin + (end - begin) // STRIDE * STRIDE
+    upside_down = bool(up[vertical] < 0)
+    # What is too much for the network is cut off at the top, wherever that is: turned worlds give the same window.
+    spare = (end - begin) % STRIDE
+    below = np.where((np.arange(3) == vertical) & upside_down, spare, 0)
+    begin, end = begin + below, end - (spare - below)
     seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))
     if len(seeds) == 0 or (end <= begin).any():
         return None
@@ -73,7 +77,6 @@ def surroundings(
         (lattice.corner + begin)[order],
         seeds[:, order],
     )
-    upside_down = bool(up[vertical] < 0)
     if upside_down:
         evidence, seeds = evidence[:, :, ::-1], seeds * np.array([1, 1, -1], dtype=np.float32)
         corner[2] = -(corner[2] + evidence.shape[2] - 1)
