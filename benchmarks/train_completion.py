@@ -42,7 +42,7 @@ MOMENTS = 5
 # Points of an image that tell how often each place was looked at.
 DRAWN = 500
 # How much visible places count in the loss, compared with all.
-LOOKS_COUNT = 8.0
+LOOKS_COUNT = 4.0
 # Truth is asked for this far into walls and floor [m]; beyond them there is nothing to know.
 INTO_WALLS = 0.3
 # Below this gap between the bounds [m] there is nothing to guess.
