@@ -29,6 +29,27 @@ class RandomRoom:
     pieces: np.ndarray
     """(n, 3) middle of the pieces of furniture [m]: what there is to look at."""
 
+    @property
+    def solids(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """What the compiled functions below take first."""
+        return self.kind, self.rotation, self.centre, self.parameters
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """True distances (n,) [m] at points (n, 3)."""
+        return scene_distance(*self.solids, points)
+
+    def inside(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Which of points (n, 3) lie in the room, or so far [m] inside its walls and its floor."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        x, y = c * points[:, 0] + s * points[:, 1], c * points[:, 1] - s * points[:, 0]
+        z = points[:, 2] - self.floor
+        return (
+            (abs(x) < self.size[0] / 2 + margin)
+            & (abs(y) < self.size[1] / 2 + margin)
+            & (z > -margin)
+            & (z < self.size[2])
+        )
+
 
 def random_room(rng: np.random.Generator) -> RandomRoom:
     """Walls, maybe a ceiling and inner walls with doorways, furniture by the walls and about the room, clutter."""
@@ -101,7 +122,22 @@ def place(
             solids += fn.placed(parts, x, y, yaw)
             pieces.append(np.array([x, y, 0.7 * top]))
             solids += clutter(rng, name, x, y, yaw, width, depth, top)
+            if any(part.name.endswith(".top") for part in parts) and rng.random() < 0.5:
+                solids += chairs(rng, name, x, y, yaw, width, depth)
             return
+
+
+def chairs(rng, name, x, y, yaw, width, depth) -> list[Primitive]:
+    """A few chairs at the sides of a table, more or less drawn out."""
+    seats: list[Primitive] = []
+    for number, turn in enumerate(np.arange(4) * np.pi / 2):
+        if rng.random() < 0.4:
+            continue
+        out = (depth if number % 2 == 0 else width) / 2 + rng.uniform(-0.2, 0.3)
+        aside = rng.uniform(-0.2, 0.2)
+        a, b = aside * np.cos(turn) - out * np.sin(turn), aside * np.sin(turn) + out * np.cos(turn)
+        seats += fn.placed(fn.chair(f"{name}.chair{number}"), a, b, turn + rng.normal(0, 0.15))
+    return list(fn.placed(tuple(seats), x, y, yaw))
 
 
 def clutter(rng, name, x, y, yaw, width, depth, top) -> list[Primitive]:
@@ -180,38 +216,80 @@ def scene_distance(kinds, rotation, centre, parameters, points):
 @njit(cache=True, nogil=True)
 @no_type_check
 def depth_image(kinds, rotation, centre, parameters, T, intrinsics, height, width, near, far):
-    """z-depth image (height, width) by sphere tracing; 0 where nothing lies between near and far [m]."""
+    """z-depth image (height, width) by casting rays; 0 where nothing lies between near and far [m]."""
     fx, fy, cx, cy = intrinsics
     depth = np.zeros((height, width), dtype=np.float32)
-    close = np.empty(len(kinds))
+    away = T[:3, 3] - centre
     for v in range(height):
         for u in range(width):
             a, b = (u - cx) / fx, (v - cy) / fy
             ray = T[:3, 0] * a + T[:3, 1] * b + T[:3, 2]
-            length = np.sqrt(a * a + b * b + 1)
-            along = 0.0
-            close[:] = -1.0
-            for _ in range(96):
-                p = T[:3, 3] + ray * (along / length)
-                d = 1e9
-                for s in range(len(kinds)):
-                    # No solid is nearer than it was, less the way made since: most need not be looked at again.
-                    if close[s] - along >= d:
-                        continue
-                    q = p - centre[s]
-                    R = rotation[s]
-                    here = solid_distance(
+            square = a * a + b * b + 1
+            best = far
+            for s in range(len(kinds)):
+                # Most rays pass a solid's bounding sphere by.
+                x, y, z = away[s, 0], away[s, 1], away[s, 2]
+                along = ray[0] * x + ray[1] * y + ray[2] * z
+                if square * (x * x + y * y + z * z - _radius(kinds[s], parameters[s]) ** 2) > along * along:
+                    continue
+                R = rotation[s]
+                best = min(
+                    best,
+                    _hit(
                         kinds[s], parameters[s],
-                        R[0, 0] * q[0] + R[0, 1] * q[1] + R[0, 2] * q[2],
-                        R[1, 0] * q[0] + R[1, 1] * q[1] + R[1, 2] * q[2],
-                        R[2, 0] * q[0] + R[2, 1] * q[1] + R[2, 2] * q[2],
-                    )  # fmt: skip
-                    close[s] = along + here
-                    d = min(d, here)
-                along += d
-                if d < 2e-3 or along > far * length:
-                    break
-            z = along / length
-            if near <= z <= far and d < 1e-2:
-                depth[v, u] = z
+                        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+                        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+                        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+                        R[0, 0] * ray[0] + R[0, 1] * ray[1] + R[0, 2] * ray[2],
+                        R[1, 0] * ray[0] + R[1, 1] * ray[1] + R[1, 2] * ray[2],
+                        R[2, 0] * ray[0] + R[2, 1] * ray[1] + R[2, 2] * ray[2],
+                    ),
+                )  # fmt: skip
+            if near <= best < far:
+                depth[v, u] = best
     return depth
+
+
+@njit(cache=True, nogil=True, inline="always")
+@no_type_check
+def _radius(kind, p):
+    """Of the bounding sphere [m]."""
+    if kind == 0:
+        return np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2)
+    return np.sqrt(p[0] ** 2 + p[1] ** 2) if kind == 1 else p[0]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _hit(kind, p, x, y, z, a, b, c):
+    """Where the ray from (x, y, z) along (a, b, c) enters a solid, in its own frame, as a multiple of the ray."""
+    enter, leave = 0.0, 1e9
+    if kind == 0:
+        enter, leave = _slab(x, a, p[0], enter, leave)
+        enter, leave = _slab(y, b, p[1], enter, leave)
+        enter, leave = _slab(z, c, p[2], enter, leave)
+        return enter if enter < leave else 1e9
+    square, half, rest = a * a + b * b, a * x + b * y, x * x + y * y - p[0] * p[0]
+    if kind == 2:
+        square, half, rest = square + c * c, half + c * z, rest + z * z
+    else:
+        enter, leave = _slab(z, c, p[1], enter, leave)
+    root = half * half - square * rest
+    if root < 0 or (square < 1e-12 and rest > 0):
+        return 1e9
+    if square >= 1e-12:
+        enter, leave = (
+            max(enter, (-half - np.sqrt(root)) / square),
+            min(leave, (-half + np.sqrt(root)) / square),
+        )
+    return enter if enter < leave else 1e9
+
+
+@njit(cache=True, nogil=True, inline="always")
+@no_type_check
+def _slab(x, a, half, enter, leave):
+    """Part of the ray x + t a within |x| < half."""
+    if abs(a) < 1e-12:
+        return (enter, leave) if abs(x) < half else (1.0, 0.0)
+    first, second = (-half - x) / a, (half - x) / a
+    return max(enter, min(first, second)), min(leave, max(first, second))

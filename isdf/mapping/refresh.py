@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .bricks import BrickVolume
 from .completion import STRIDE, CompletionNet, features
-from .evidence import bounds, gather
+from .evidence import Evidence, bounds, gather
 from .lattice import Lattice
 from .nearest import finer_nearest
 from .refinement import cells_to_refine, middle_values, near_known, refined_values
@@ -26,6 +28,60 @@ NODES_ACROSS, NODES_ALONG = 28, 16
 PATCH = 0.5
 
 Box = Float[np.ndarray, "2 3"]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is proven in a box about the camera, turned as the network knows it: the vertical is the last axis, upwards.
+
+    Args:
+        proven: of the box's nodes.
+        corner: lattice index of the first of them, along the network's axes.
+        begin: first node of the box, as array index of the lattice.
+        end: one past its last.
+        order: axis of the lattice for each of the network's.
+        upside_down: the lattice's vertical axis points down.
+    """
+
+    proven: Evidence
+    corner: Int[np.ndarray, "3"]
+    begin: Int[np.ndarray, "3"]
+    end: Int[np.ndarray, "3"]
+    order: list[int]
+    upside_down: bool
+
+    def in_lattice(self, answer: np.ndarray) -> np.ndarray:
+        """An answer of the network along the lattice's axes."""
+        return (answer[:, :, ::-1] if self.upside_down else answer).transpose(np.argsort(self.order))
+
+
+def surroundings(
+    lattice: Lattice, bricks: BrickVolume, eye: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
+) -> Surroundings | None:
+    """What the network goes by; None where there is nothing. Arguments as for `guess`."""
+    vertical = int(np.abs(up).argmax())
+    reach = np.full(3, min(GUESS_ACROSS, NODES_ACROSS * lattice.spacing))
+    reach[vertical] = min(GUESS_ALONG, NODES_ALONG * lattice.spacing)
+    begin, end = lattice.window(eye - reach, eye + reach)
+    upside_down = bool(up[vertical] < 0)
+    # What is too much for the network is cut off at the top, wherever that is: turned worlds give the same window.
+    spare = (end - begin) % STRIDE
+    below = np.where((np.arange(3) == vertical) & upside_down, spare, 0)
+    begin, end = begin + below, end - (spare - below)
+    seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))
+    if len(seeds) == 0 or (end <= begin).any():
+        return None
+    order = [axis for axis in range(3) if axis != vertical] + [vertical]
+    evidence, corner, seeds = (
+        lattice.read("evidence", begin, end).transpose(order),
+        (lattice.corner + begin)[order],
+        seeds[:, order],
+    )
+    if upside_down:
+        evidence, seeds = evidence[:, :, ::-1], seeds * np.array([1, 1, -1], dtype=np.float32)
+        corner[2] = -(corner[2] + evidence.shape[2] - 1)
+    proven = gather(np.ascontiguousarray(seeds), np.ascontiguousarray(evidence), corner, lattice.spacing)
+    return Surroundings(proven, corner, begin, end, order, upside_down)
 
 
 def guess(
@@ -47,30 +103,11 @@ def guess(
     Returns:
         The box [m] that is to be refreshed, or None where there was nothing to go by.
     """
-    vertical = int(np.abs(up).argmax())
-    reach = np.full(3, min(GUESS_ACROSS, NODES_ACROSS * lattice.spacing))
-    reach[vertical] = min(GUESS_ALONG, NODES_ALONG * lattice.spacing)
-    begin, end = lattice.window(eye - reach, eye + reach)
-    end = begin + (end - begin) // STRIDE * STRIDE
-    seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))
-    if len(seeds) == 0 or (end <= begin).any():
+    around = surroundings(lattice, bricks, eye, up)
+    if around is None:
         return None
-    # The network knows the vertical as the last axis, upwards.
-    order = [axis for axis in range(3) if axis != vertical] + [vertical]
-    evidence, corner, seeds = (
-        lattice.read("evidence", begin, end).transpose(order),
-        (lattice.corner + begin)[order],
-        seeds[:, order],
-    )
-    upside_down = up[vertical] < 0
-    if upside_down:
-        evidence, seeds = evidence[:, :, ::-1], seeds * np.array([1, 1, -1], dtype=np.float32)
-        corner[2] = -(corner[2] + evidence.shape[2] - 1)
-    proven = gather(np.ascontiguousarray(seeds), np.ascontiguousarray(evidence), corner, lattice.spacing)
-    share, width = (
-        (answer[:, :, ::-1] if upside_down else answer).transpose(np.argsort(order))
-        for answer in _run(network, features(proven))
-    )
+    share, width = (around.in_lattice(answer) for answer in _run(network, features(around.proven)))
+    begin, end = around.begin, around.end
     lattice.write(begin, end, share=share, width=width)
     return lattice.spacing * np.stack([lattice.corner + begin, lattice.corner + end - 1])
 

@@ -19,6 +19,9 @@ SEED_ODDS, FAINT_ODDS, FAINT_WEIGHT = 0.003, 0.15, 0.1
 # In space looked through, a guess that takes off less than this share of its own expected error takes off nothing: the
 # network's sigmoid never reaches zero, but there the median mostly is zero.
 LEAST_OF_ERROR = 0.5
+# However sure the network is of a guess, it may err by this share of the gap more than it expects, and so much [m] at
+# most: rooms differ from those it has learned from.
+UNFORESEEN, MOST_UNFORESEEN = np.float32(0.09), np.float32(0.017)
 
 
 class Patches(NamedTuple):
@@ -92,7 +95,7 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
                 else:
                     low = max(min(low, np.float32(0)), -upper)
                 gap = upper - low
-                error = gap * np.exp(window.width[i, j, k])
+                error = gap * np.exp(window.width[i, j, k]) + min(UNFORESEEN * gap, MOST_UNFORESEEN)
                 share = window.share[i, j, k]
                 if sign > 0 and share < LEAST_OF_ERROR * np.exp(window.width[i, j, k]):
                     share = np.float32(0)

@@ -1,0 +1,44 @@
+"""What the completion network learns from: exact images of random rooms, and windows as the mapper makes them."""
+
+import numpy as np
+
+from benchmarks.camera_ways import camera_way
+from benchmarks.random_rooms import depth_image, random_room
+from benchmarks.train_completion import turned, windows
+from isdf.mapping.completion import CHANNELS, STRIDE
+
+
+def test_rays_end_at_the_first_surface():
+    rng = np.random.default_rng(3)
+    room = random_room(rng)
+    _, poses = camera_way(rng, room)
+    T = poses[0]
+    depth = depth_image(*room.solids, T, (70.0, 70.0, 39.5, 29.5), 60, 80, 0.1, 10.0)
+    v, u = np.nonzero(depth)
+    assert len(v) > 0.5 * depth.size
+    rays = np.stack([(u - 39.5) / 70, (v - 29.5) / 70, np.ones(len(v))], axis=1) @ T[:3, :3].T
+    ends = T[:3, 3] + rays * depth[v, u, None]
+    assert np.abs(room.distance(ends)).max() < 1e-5
+    for share in np.linspace(0, 0.99, 20):
+        assert room.distance(T[:3, 3] + share * (ends - T[:3, 3])).min() > 0
+
+
+def test_truth_of_a_window_lies_between_its_bounds():
+    _, window = list(windows(np.random.default_rng(3)))[-1]
+    assert window.x.shape[0] == CHANNELS and all(side % STRIDE == 0 for side in window.x.shape[1:])
+    free = window.mask & (window.x[2] > 0)
+    upper, lower, truth = window.x[0][free], window.x[1][free], window.truth[free]
+    assert free.sum() > 1000 and window.looks[free].sum() > 0.8 * window.looks.sum()
+    assert ((truth > upper + 0.05) & (upper < 3)).float().mean() < 0.01
+    assert (truth < lower - 0.08).float().mean() < 0.02
+
+
+def test_turning_a_window_turns_its_directions():
+    _, window = next(windows(np.random.default_rng(3)))
+    for seed in range(8):
+        other = turned(window, np.random.default_rng(seed))
+        # Against the direction to the closest surface the distance to it grows.
+        for axis in range(2):
+            slope = other.x[0].diff(dim=axis).narrow(1 - axis, 0, 8)
+            along = other.x[4 + axis].narrow(axis, 0, slope.shape[axis]).narrow(1 - axis, 0, 8)
+            assert (slope * along).sum() < 0
