@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.random_rooms import RandomRoom
 from planning.path_reference import wrapped
+from robots.simulation.poses import looking
 
 # How often each kind of way is taken: driving about, driving past pieces of furniture, going up to one, by hand.
 KINDS = {"drive": 0.3, "visit": 0.25, "reach": 0.3, "hand": 0.15}
@@ -114,7 +115,7 @@ class _Robot:
             np.sin(azimuth) * np.cos(elevation),
             np.sin(elevation),
         ]
-        self.poses.append(looking(self.eye, self.eye + np.array(direction)))
+        self.poses.append(looking(self.eye, direction))
         self.time += PERIOD
 
 
@@ -176,7 +177,7 @@ def _by_hand(rng: np.random.Generator, room: RandomRoom) -> Iterator[np.ndarray]
         if still:
             eye, at = eye + rng.normal(0, 0.1, 3), target + rng.normal(0, 0.45, 3) * np.array([1, 1, 0.4])
         if room.inside(eye[None])[0] and room.distance(eye[None])[0] > 0.1:
-            yield looking(eye, at)
+            yield looking(eye, at - eye)
 
 
 def _free_place(
@@ -200,14 +201,3 @@ def _is_free(room: RandomRoom, places: np.ndarray) -> np.ndarray:
         distance = room.distance(points)
         free &= room.inside(points) & (distance > min(CLEARANCE, height - 0.02))
     return free
-
-
-def looking(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """T_world_camera (4, 4) of a level camera at `eye` that looks at `at` [m]."""
-    z = (at - eye) / np.linalg.norm(at - eye)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x) + 1e-9
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    T[:3, 3] = eye
-    return T
