@@ -31,6 +31,7 @@ from .fusion import fuse, nearest_around
 from .lattice import Lattice
 from .motion import Moment, Motion
 from .refresh import guess, refresh
+from .standing import extend_down, vertical
 from .visitors import Visitors
 
 logger = logging.getLogger(__name__)
@@ -118,11 +119,16 @@ class Mapper(ShownMapper):
         seen = bounds.numpy().astype(float)
         self.lattice.include(np.minimum(seen[0] - beyond, box[0]), np.maximum(seen[1] + beyond, box[1]))
         self._bounds, self.up = bounds, up
-        self.visitors.watch(depth, appeared, stride, _intrinsics(frame), T, frame.time)
+        axis, way = vertical(up)
+        floor = float(seen[0 if way > 0 else 1, axis])
+        self.visitors.watch(depth, appeared, stride, _intrinsics(frame), T, up, floor, frame.time)
         self._fuse(depth, T, frame, box, appeared, stride)
         self._motion.believe(Moment(depth, _intrinsics(frame), T, frame.time))
         self.frames_seen += 1
-        self._touch(box + np.array([[-MARGIN], [MARGIN]]))
+        feet = self.visitors.stand(depth, _intrinsics(frame), np.linalg.inv(T), up)
+        for part in (box, feet):
+            if part is not None:
+                self._touch(part + np.array([[-MARGIN], [MARGIN]]))
         # A clock that stands still or jumps back must not stop the refreshing.
         if not self._ready or not 0 < frame.time - self._guessed_at < self.config.guess_period:
             self._guess(T[:3, 3])
@@ -311,7 +317,9 @@ def compile_kernels() -> None:
         frame = DepthFrame(depth, torch.eye(4), camera, time=float(2 * index))
         mapper.integrate(frame)
     anywhere, T = np.ones((12, 16), dtype=bool), frame.T_world_camera.numpy()
-    mapper.visitors.watch(depth.numpy(), anywhere, 1, _intrinsics(frame), T, frame.time)
+    intrinsics, none = _intrinsics(frame), np.empty((0, 4), dtype=np.int64)
+    mapper.visitors.watch(depth.numpy(), anywhere, 1, intrinsics, T, mapper.up, 1.0, frame.time)
+    extend_down(mapper.bricks.arrays, none, *vertical(mapper.up), depth.numpy(), intrinsics, np.linalg.inv(T))
     field = mapper.field()
     for dtype in (torch.float32, torch.float64):
         field.distance_and_gradient(torch.zeros(1, 3, dtype=dtype))

@@ -3,6 +3,9 @@
 A camera sees where people were last before they left its view; as far as it knows they stand there for good. So every
 brick that something comes into is kept as it was, and given back when nothing was seen in it for a while. What stays in
 view in one place is no visitor.
+
+A camera that looks ahead sees no more than the upper half of who stands close to it. Who comes into free space stands
+on the floor: what was seen of him goes on down to it, where the image does not show otherwise.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from scipy.ndimage import binary_dilation
 from .bricks import SIDE, Bricks, BrickVolume
 from .evidence import FREE_ABOVE, INSIDE
 from .lattice import Lattice, LatticeArrays, node_at
+from .standing import columns, corners, extend_down, feet, vertical
 
 # Seen in one brick for longer than this [s], something has come to stay. Whoever walks is through in two, but may wait
 # for a robot for a while.
@@ -27,6 +31,8 @@ NEAR = 1.2
 BEFORE = 0.12
 # Coarse nodes a side of a brick.
 NODES = 2
+# Mark of a brick in which something that came was measured, not only hidden.
+SURFACE = 2
 
 
 class Kept(NamedTuple):
@@ -69,6 +75,7 @@ class Visitors:
     def __init__(self, bricks: BrickVolume, lattice: Lattice, memory: float | None) -> None:
         self.bricks, self.lattice, self.memory = bricks, lattice, memory
         self._kept = self._copied(np.empty((0, 3), dtype=np.int64), 0.0)
+        self._feet = np.empty((0, 4), dtype=np.int64)
 
     def watch(
         self,
@@ -77,6 +84,8 @@ class Visitors:
         stride: int,
         intrinsics: tuple[float, float, float, float],
         T_world_camera: Float[np.ndarray, "4 4"],
+        up: Float[np.ndarray, "3"],
+        floor: float,
         now: float,
     ) -> None:
         """Keep what a depth image [m] is about to change in space that was free; call before it is fused.
@@ -87,21 +96,49 @@ class Visitors:
             stride: in pixels.
             intrinsics: fx, fy, cx, cy.
             T_world_camera: pose.
+            up: any vector whose largest component tells the vertical and its sign the way up.
+            floor: where the floor is along that axis [m].
             now: time of the image [s].
         """
+        self._feet = self._feet[:0]
         if self.memory is None or not (appeared.any() or len(self._kept.place)):
             return
         table = self._table()
-        visited = visited_bricks(
+        marks = visited_bricks(
             self.bricks.arrays, self.lattice.arrays, self.lattice.corner, table, self._kept.evidence, depth,
             appeared, stride, intrinsics, T_world_camera,
         )  # fmt: skip
+        visited = marks > 0
+        axis, way = vertical(up)
+        ground = int(np.floor(floor / (SIDE * self.bricks.voxel))) - int(self.bricks.corner[axis])
+        self._feet = feet(marks == SURFACE, self._in_lattice(), axis, way, ground)
+        visited[tuple(columns(self._feet, axis, way).T)] = True
         # Whoever walks on comes into the neighbours next, little by little: keep those, too.
         near = binary_dilation(visited, np.ones((3, 3, 3), dtype=bool)) & (table < 0) & self._in_lattice()
         self._kept = self._kept.and_also(self._copied(np.argwhere(near) + self.bricks.corner, now))
         rows = self._table()[visited & self._in_lattice()]
         self._kept.first[rows] = np.minimum(self._kept.first[rows], now)
         self._kept.last[rows] = now
+
+    def stand(
+        self,
+        depth: Float[np.ndarray, "h w"],
+        intrinsics: tuple[float, float, float, float],
+        T_camera_world: Float[np.ndarray, "4 4"],
+        up: Float[np.ndarray, "3"],
+    ) -> Float[np.ndarray, "2 3"] | None:
+        """Let those who were seen by the last `watch` stand on the floor; call after the image is fused.
+
+        Returns:
+            The box [m] that is to be refreshed, None where nothing has changed.
+        """
+        if len(self._feet) == 0:
+            return None
+        axis, way = vertical(up)
+        under = np.unique(columns(self._feet, axis, way), axis=0)
+        self.bricks.add(under[self.bricks.table[tuple(under.T)] < 0])
+        extend_down(self.bricks.arrays, self._feet, axis, way, depth, intrinsics, T_camera_world)
+        return SIDE * self.bricks.voxel * (self.bricks.corner + corners(under))
 
     def take_back(self, eye: Float[np.ndarray, "3"], now: float) -> Float[np.ndarray, "2 3"] | None:
         """Give back the bricks whose visitors have been out of view for long enough.
@@ -125,7 +162,7 @@ class Visitors:
         if len(back.place) == 0:
             return None
         self._give_back(back)
-        return edge * np.stack([back.place.min(axis=0), back.place.max(axis=0) + 1])
+        return edge * corners(back.place)
 
     def _table(self) -> Int[np.ndarray, "nx ny nz"]:
         """Row of every brick that is kept, -1 elsewhere; as large as the table of bricks, which never shrinks."""
@@ -183,7 +220,7 @@ class Visitors:
 def visited_bricks(
     bricks: Bricks, lattice: LatticeArrays, first_node, kept, evidence, depth, appeared, stride, intrinsics, T_wc
 ):  # fmt: skip
-    """Mark the bricks of the table in which something stands that has come.
+    """Mark the bricks of the table in which something stands that has come: SURFACE where it was measured, else 1.
 
     Args:
         bricks: before the image is fused.
@@ -196,7 +233,7 @@ def visited_bricks(
     fx, fy, cx, cy = intrinsics
     R, t = T_wc[:3, :3], T_wc[:3, 3]
     table, corner, edge = bricks.table, bricks.corner, SIDE * bricks.voxel
-    out = np.zeros(table.shape, dtype=np.bool_)
+    out = np.zeros(table.shape, dtype=np.uint8)
     ray, point, index = np.empty(3), np.empty(3), np.empty(3, np.int64)
     steps = int(np.ceil((BEFORE + INSIDE) / (0.5 * edge)))
     for row in range(appeared.shape[0]):
@@ -218,14 +255,15 @@ def visited_bricks(
                 known = kept[index[0], index[1], index[2]] >= 0
                 if not known or not _was_free(lattice, first_node, kept, corner, evidence, point):
                     continue
+            out[index[0], index[1], index[2]] = SURFACE
             for n in range(steps + 1):
                 w = z - BEFORE + (BEFORE + INSIDE) * n / steps
                 inside = True
                 for axis in range(3):
                     index[axis] = int(np.floor((t[axis] + w * ray[axis]) / edge)) - corner[axis]
                     inside &= 0 <= index[axis] < table.shape[axis]
-                if inside:
-                    out[index[0], index[1], index[2]] = True
+                if inside and out[index[0], index[1], index[2]] == 0:
+                    out[index[0], index[1], index[2]] = 1
     return out
 
 

@@ -91,6 +91,22 @@ def test_the_room_stays_as_it_was():
     assert errors[1] < 1.1 * errors[0]
 
 
+def test_who_is_seen_from_the_waist_up_stands_on_the_floor():
+    place = (EYE[0] + 0.7, EYE[1] + 0.7)
+    shin = torch.linspace(-0.1, 0.1, 5)
+    west, south = torch.full((5,), place[0] - 0.15), torch.full((5,), place[1] - 0.15)
+    sides = torch.cat([torch.stack([west, place[1] + shin], 1), torch.stack([place[0] + shin, south], 1)])
+    legs = torch.cat([torch.cat([sides, torch.full((10, 1), height)], dim=1) for height in (0.2, 0.4)])
+    errors = []
+    for memory in (None, 2.0):
+        mapper = Mapper(MapperConfig(visitors=memory))
+        watch(mapper, THERE, 2.0)
+        watch(mapper, (*place, EYE[2] + 0.1), 1.0, place)
+        mapper.refresh()
+        errors.append(float(mapper.field().distance(legs).abs().mean()))
+    assert errors[0] > 0.05 and errors[1] < 0.6 * errors[0], errors
+
+
 def test_what_is_seen_to_stay_is_kept():
     mapper = Mapper(MapperConfig(visitors=2.0))
     watch(mapper, THERE, 2.0)
