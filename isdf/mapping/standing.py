@@ -12,6 +12,8 @@ from .bricks import SIDE, Bricks
 
 # Nobody's feet are more than so many bricks under what is seen of him.
 TALL = 6
+# Fewer pixels in a column of bricks show nobody, but the edge of something that was overlooked.
+MANY = 50
 # What is this far behind a measured surface [m] is hidden by it.
 HIDDEN = 0.12
 
@@ -28,7 +30,7 @@ def corners(places: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "2 3"]:
 
 
 def feet(
-    seen: Bool[np.ndarray, "nx ny nz"],
+    pixels: Int[np.ndarray, "nx ny nz"],
     inside: Bool[np.ndarray, "nx ny nz"],
     axis: int,
     way: int,
@@ -37,14 +39,15 @@ def feet(
     """The lowest bricks in which somebody was seen, and how many bricks under each the floor is; none where it is far.
 
     Args:
-        seen: somebody was measured in these bricks of the table.
+        pixels: how many show somebody in each brick of the table.
         inside: these may be changed.
         axis: the vertical.
         way: 1 if the axis points up, else -1.
         ground: array index of the bricks of the floor along that axis.
     """
     lowest: dict[tuple[int, ...], np.ndarray] = {}
-    for place in np.argwhere(seen):
+    many = np.maximum(pixels, 0).sum(axis=axis, keepdims=True) >= MANY
+    for place in np.argwhere((pixels > 0) & many):
         column = tuple(int(n) for n in np.delete(place, axis))
         if column not in lowest or way * place[axis] < way * lowest[column][axis]:
             lowest[column] = place
@@ -52,7 +55,7 @@ def feet(
     for place in lowest.values():
         steps, end = way * (place[axis] - ground), place.copy()
         end[axis] = ground
-        if 0 < steps <= TALL and 0 <= ground < seen.shape[axis] and inside[tuple(end)]:
+        if 0 < steps <= TALL and 0 <= ground < pixels.shape[axis] and inside[tuple(end)]:
             out.append(np.array([[*place, steps]]))
     return np.concatenate(out)
 

@@ -31,8 +31,6 @@ NEAR = 1.2
 BEFORE = 0.12
 # Coarse nodes a side of a brick.
 NODES = 2
-# Mark of a brick in which something that came was measured, not only hidden.
-SURFACE = 2
 
 
 class Kept(NamedTuple):
@@ -104,14 +102,14 @@ class Visitors:
         if self.memory is None or not (appeared.any() or len(self._kept.place)):
             return
         table = self._table()
-        marks = visited_bricks(
+        pixels = visited_bricks(
             self.bricks.arrays, self.lattice.arrays, self.lattice.corner, table, self._kept.evidence, depth,
             appeared, stride, intrinsics, T_world_camera,
         )  # fmt: skip
-        visited = marks > 0
+        visited = pixels != 0
         axis, way = vertical(up)
         ground = int(np.floor(floor / (SIDE * self.bricks.voxel))) - int(self.bricks.corner[axis])
-        self._feet = feet(marks == SURFACE, self._in_lattice(), axis, way, ground)
+        self._feet = feet(pixels, self._in_lattice(), axis, way, ground)
         visited[tuple(columns(self._feet, axis, way).T)] = True
         # Whoever walks on comes into the neighbours next, little by little: keep those, too.
         near = binary_dilation(visited, np.ones((3, 3, 3), dtype=bool)) & (table < 0) & self._in_lattice()
@@ -220,7 +218,7 @@ class Visitors:
 def visited_bricks(
     bricks: Bricks, lattice: LatticeArrays, first_node, kept, evidence, depth, appeared, stride, intrinsics, T_wc
 ):  # fmt: skip
-    """Mark the bricks of the table in which something stands that has come: SURFACE where it was measured, else 1.
+    """How many pixels show something that has come in each brick of the table; -1 where it only hides what is there.
 
     Args:
         bricks: before the image is fused.
@@ -233,7 +231,7 @@ def visited_bricks(
     fx, fy, cx, cy = intrinsics
     R, t = T_wc[:3, :3], T_wc[:3, 3]
     table, corner, edge = bricks.table, bricks.corner, SIDE * bricks.voxel
-    out = np.zeros(table.shape, dtype=np.uint8)
+    out = np.zeros(table.shape, dtype=np.int32)
     ray, point, index = np.empty(3), np.empty(3), np.empty(3, np.int64)
     steps = int(np.ceil((BEFORE + INSIDE) / (0.5 * edge)))
     for row in range(appeared.shape[0]):
@@ -255,7 +253,7 @@ def visited_bricks(
                 known = kept[index[0], index[1], index[2]] >= 0
                 if not known or not _was_free(lattice, first_node, kept, corner, evidence, point):
                     continue
-            out[index[0], index[1], index[2]] = SURFACE
+            out[index[0], index[1], index[2]] = max(out[index[0], index[1], index[2]], 0) + 1
             for n in range(steps + 1):
                 w = z - BEFORE + (BEFORE + INSIDE) * n / steps
                 inside = True
@@ -263,7 +261,7 @@ def visited_bricks(
                     index[axis] = int(np.floor((t[axis] + w * ray[axis]) / edge)) - corner[axis]
                     inside &= 0 <= index[axis] < table.shape[axis]
                 if inside and out[index[0], index[1], index[2]] == 0:
-                    out[index[0], index[1], index[2]] = 1
+                    out[index[0], index[1], index[2]] = -1
     return out
 
 
