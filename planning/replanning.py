@@ -71,7 +71,7 @@ class ReplanningConfig:
     def __post_init__(self) -> None:
         positive = ("scan_rate", "retry", "wait", "detour", "extend", "stuck", "time_limit")
         values = [getattr(self, name) for name in positive]
-        if not min(values) > 0:
+        if not all(value > 0 for value in values):  # NaN is not
             got = ", ".join(f"{name} {value:g}" for name, value in zip(positive, values, strict=True))
             raise ConfigError(f"ReplanningConfig: these must be positive: {got}.")
 

@@ -9,13 +9,12 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from .bricks import SIDE, Bricks
+from .evidence import BAND
 
 # Nobody's feet are more than so many bricks under what is seen of him.
 TALL = 6
 # Fewer pixels in a column of bricks show nobody, but the edge of something that was overlooked.
 MANY = 50
-# What is this far behind a measured surface [m] is hidden by it.
-HIDDEN = 0.12
 
 
 def vertical(up: Float[np.ndarray, "3"]) -> tuple[int, int]:
@@ -116,7 +115,7 @@ def extend_down(bricks: Bricks, feet, axis, way, depth, intrinsics, T_camera_wor
                         y = R[1, 0] * point[0] + R[1, 1] * point[1] + R[1, 2] * point[2] + t[1]
                         u, v = int(np.floor(x / z * fx + cx + 0.5)), int(np.floor(y / z * fy + cy + 0.5))
                         looked_at = 0 <= u < depth.shape[1] and 0 <= v < depth.shape[0]
-                        if looked_at and depth[v, u] > z - HIDDEN:
+                        if looked_at and depth[v, u] > z - BAND:
                             continue
                     if weights[row, at] <= 0 or distances[row, at] > value:
                         distances[row, at], weights[row, at] = value, weight

@@ -101,7 +101,7 @@ class Visitors:
         self._feet = self._feet[:0]
         if self.memory is None or not (appeared.any() or len(self._kept.place)):
             return
-        table = self._table()
+        table, inside = self._table(), self._in_lattice()
         pixels = visited_bricks(
             self.bricks.arrays, self.lattice.arrays, self.lattice.corner, table, self._kept.evidence, depth,
             appeared, stride, intrinsics, T_world_camera,
@@ -109,12 +109,12 @@ class Visitors:
         visited = pixels != 0
         axis, way = vertical(up)
         ground = int(np.floor(floor / (SIDE * self.bricks.voxel))) - int(self.bricks.corner[axis])
-        self._feet = feet(pixels, self._in_lattice(), axis, way, ground)
+        self._feet = feet(pixels, inside, axis, way, ground)
         visited[tuple(columns(self._feet, axis, way).T)] = True
         # Whoever walks on comes into the neighbours next, little by little: keep those, too.
-        near = binary_dilation(visited, np.ones((3, 3, 3), dtype=bool)) & (table < 0) & self._in_lattice()
+        near = binary_dilation(visited, np.ones((3, 3, 3), dtype=bool)) & (table < 0) & inside
         self._kept = self._kept.and_also(self._copied(np.argwhere(near) + self.bricks.corner, now))
-        rows = self._table()[visited & self._in_lattice()]
+        rows = self._table()[visited & inside]
         self._kept.first[rows] = np.minimum(self._kept.first[rows], now)
         self._kept.last[rows] = now
 

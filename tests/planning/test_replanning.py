@@ -253,6 +253,7 @@ def test_an_empty_report_is_no_success() -> None:
         {"scan_rate": 0.0},
         {"retry": -1.0},
         {"wait": 0.0},
+        {"detour": math.nan},
         {"stuck": 0.0},
         {"time_limit": 0.0},
     ],
