@@ -25,6 +25,7 @@ class Bricks(NamedTuple):
         corner: (3,) lattice index of the table's first brick.
         distance: (bricks, 512) float32 [m].
         weight: (bricks, 512) float32.
+        ended: (bricks, 512) float32, share of the views, by weight, that ended there, see `isdf.mapping.fusion.HIDDEN`.
         voxel: edge of a voxel [m].
     """
 
@@ -32,6 +33,7 @@ class Bricks(NamedTuple):
     corner: np.ndarray
     distance: np.ndarray
     weight: np.ndarray
+    ended: np.ndarray
     voxel: float
 
 
@@ -52,6 +54,7 @@ class BrickVolume:
         self.count = 0
         self._distance = np.zeros((256, VOXELS), dtype=np.float32)
         self._weight = np.zeros((256, VOXELS), dtype=np.float32)
+        self._ended = np.zeros((256, VOXELS), dtype=np.float32)
 
     @property
     def distance(self) -> Float[np.ndarray, "bricks 512"]:
@@ -64,9 +67,14 @@ class BrickVolume:
         return self._weight[: self.count]
 
     @property
+    def ended(self) -> Float[np.ndarray, "bricks 512"]:
+        """Share of the views of every voxel, by weight, that ended there: evidence of a surface in [0, 1]."""
+        return self._ended[: self.count]
+
+    @property
     def arrays(self) -> Bricks:
         """For compiled code, which may change the distances and weights in place."""
-        return Bricks(self.table, self.corner, self._distance, self._weight, self.voxel)
+        return Bricks(self.table, self.corner, self._distance, self._weight, self._ended, self.voxel)
 
     def box(
         self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]
@@ -80,7 +88,7 @@ class BrickVolume:
     @property
     def nbytes(self) -> int:
         """Memory in use [bytes]."""
-        return self.table.nbytes + self.distance.nbytes + self.weight.nbytes
+        return self.table.nbytes + self.distance.nbytes + self.weight.nbytes + self.ended.nbytes
 
     def include(self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]) -> None:
         """Grow the table of bricks to cover a world box [m].
@@ -113,6 +121,7 @@ class BrickVolume:
             more = np.zeros((max(256, len(self._distance)), VOXELS), dtype=np.float32)
             self._distance = np.concatenate([self._distance, more])
             self._weight = np.concatenate([self._weight, more])
+            self._ended = np.concatenate([self._ended, more])
         self.table[tuple(places.T)] = np.arange(self.count, self.count + len(places))
         self.count += len(places)
 
@@ -121,20 +130,21 @@ class BrickVolume:
         table: Int[np.ndarray, "nx ny nz"],
         distance: Float[np.ndarray, "n 512"],
         weight: Float[np.ndarray, "n 512"],
+        ended: Float[np.ndarray, "n 512"],
     ) -> None:
         """Take over the bricks of another volume.
 
         Raises:
             FrameError: the arrays do not fit each other.
         """
-        if table.ndim != 3 or distance.shape != weight.shape or distance.shape[1:] != (VOXELS,):
-            raise FrameError(
-                f"bricks of shapes {table.shape}, {distance.shape} and {weight.shape} do not fit"
-            )
+        shapes = {distance.shape, weight.shape, ended.shape}
+        if table.ndim != 3 or len(shapes) > 1 or distance.shape[1:] != (VOXELS,):
+            raise FrameError(f"bricks of shapes {table.shape} and {sorted(shapes)} do not fit")
         if table.max(initial=-1) >= len(distance) or table.min(initial=-1) < -1:
             raise FrameError(f"a table of bricks up to {table.max()} does not fit {len(distance)} bricks")
         self.table, self.count = table.astype(np.int32), len(distance)
         self._distance, self._weight = distance.astype(np.float32), weight.astype(np.float32)
+        self._ended = ended.astype(np.float32)
 
 
 def moved(

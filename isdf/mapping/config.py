@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ..errors import ConfigError
 from ..numbers import require_finite
 
-# Four times the default limit; a brick takes four kilobytes, though most places never get one.
+# Four times the default limit; a brick takes six kilobytes, though most places never get one.
 MOST_BRICKS = 1 << 25
 
 
@@ -30,7 +30,7 @@ class MapperConfig:
     """
 
     voxel: float = 0.04
-    truncation: float = 0.12
+    truncation: float = 0.1
     truncation_noise: float = 0.012
     max_depth: float = 10.0
     max_weight: float = 20.0

@@ -22,6 +22,9 @@ NOISE_FLOOR_DEPTH = 0.5
 TRUST, TRUST_SEEN_THROUGH = 8.0, 1.0
 # How far around, as the tangent of an angle, and how far behind, in truncations.
 AROUND, FAR_BEHIND = 0.015, 1.5
+# Evidence of a surface that a view gives which ends before a voxel, beside 1 of one that ends within a voxel of it and
+# none of one that goes on behind it: the thing that hides the voxel may reach as far.
+HIDDEN = 0.3
 
 
 def nearest_around(depth: Float[np.ndarray, "h w"], focal: float) -> Float[np.ndarray, "h w"]:
@@ -49,7 +52,7 @@ def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, in
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-    table, corner, distances, weights, voxel = bricks
+    table, corner, distances, weights, ended, voxel = bricks
     radius = 7.0 * voxel
     for bi in range(begin[0], end[0]):
         for bj in range(begin[1], end[1]):
@@ -107,3 +110,5 @@ def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, in
                             total = before + weight
                             distances[brick, at] = (old * before + value * weight) / total
                             weights[brick, at] = min(total, max_weight)
+                            kind = np.float32(1 if abs(ahead) <= voxel else (HIDDEN if ahead < 0 else 0))
+                            ended[brick, at] = (ended[brick, at] * before + kind * weight) / total

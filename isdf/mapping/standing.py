@@ -85,13 +85,13 @@ def extend_down(bricks: Bricks, feet, axis, way, depth, intrinsics, T_camera_wor
     """
     fx, fy, cx, cy = intrinsics
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-    table, corner, distances, weights, voxel = bricks
+    table, corner, distances, weights, ended, voxel = bricks
     across = np.array([1, 2]) if axis == 0 else (np.array([0, 2]) if axis == 1 else np.array([0, 1]))
     brick, local, point = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3)
     for n in range(feet.shape[0]):
         for p in range(SIDE):
             for q in range(SIDE):
-                value, weight = np.float32(0), np.float32(0)
+                value, weight, end = np.float32(0), np.float32(0), np.float32(0)
                 for layer in range(SIDE - 1, -SIDE * feet[n, 3] - 1, -1):
                     for a in range(3):
                         brick[a] = feet[n, a]
@@ -103,7 +103,7 @@ def extend_down(bricks: Bricks, feet, axis, way, depth, intrinsics, T_camera_wor
                     row = table[brick[0], brick[1], brick[2]]
                     at = local[0] * 64 + local[1] * 8 + local[2]
                     if down == 0 and weights[row, at] > 0:
-                        value, weight = distances[row, at], weights[row, at]
+                        value, weight, end = distances[row, at], weights[row, at], ended[row, at]
                         continue
                     if weight <= 0:
                         continue
@@ -118,4 +118,4 @@ def extend_down(bricks: Bricks, feet, axis, way, depth, intrinsics, T_camera_wor
                         if looked_at and depth[v, u] > z - BAND:
                             continue
                     if weights[row, at] <= 0 or distances[row, at] > value:
-                        distances[row, at], weights[row, at] = value, weight
+                        distances[row, at], weights[row, at], ended[row, at] = value, weight, end

@@ -19,7 +19,7 @@ from .lattice import BLOCK, CHUNK, NODES
 from .mapper import Mapper
 
 FORMAT = "isdf-lattice-map"
-VERSION = 2
+VERSION = 3
 
 
 def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
@@ -42,6 +42,7 @@ def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
     # Half precision: a hundredth of the noise that is left in them.
     arrays["bricks.distance"] = bricks.distance.astype(np.float16)
     arrays["bricks.weight"] = bricks.weight.astype(np.float16)
+    arrays["bricks.ended"] = bricks.ended.astype(np.float16)
     tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
     header = {
         "format": FORMAT,
@@ -77,7 +78,7 @@ def _restored(tensors: dict[str, Tensor], header: dict[str, Any], device: str | 
     bricks, lattice = mapper.bricks, mapper.lattice
     bricks.corner = np.array(header["bricks_corner"], dtype=np.int64).reshape(3)
     lattice.corner = np.array(header["lattice_corner"], dtype=np.int64).reshape(3)
-    bricks.restore(arrays["bricks.table"], arrays["bricks.distance"], arrays["bricks.weight"])
+    bricks.restore(*(arrays[f"bricks.{name}"] for name in ("table", "distance", "weight", "ended")))
     nodes = {name: arrays[f"lattice.{name}"] for name in NODES}
     lattice.table = arrays["lattice.table"]
     corrections, rows = arrays["lattice.corrections"], len(nodes["value"])

@@ -27,8 +27,8 @@ from .standing import columns, corners, extend_down, feet, vertical
 STAYS = 5.0
 # What is nearer than this to the camera [m] is not taken back: close to its own robot a camera sees little.
 NEAR = 1.2
-# A visitor changes bricks from this far before its surface [m] up to `INSIDE` behind it.
-BEFORE = 0.12
+# A visitor changes bricks from this far before its surface, the least truncation [m], up to `INSIDE` behind it.
+BEFORE = 0.1
 # Coarse nodes a side of a brick.
 NODES = 2
 
@@ -42,6 +42,7 @@ class Kept(NamedTuple):
         last: (n,) when something was seen in it last, or when it was kept [s].
         distance: (n, 512) float32 [m].
         weight: (n, 512) float32, 0 where nothing was observed.
+        ended: (n, 512) float32, see `isdf.mapping.bricks.Bricks`.
         evidence: (n, 2, 2, 2) uint8 of its coarse nodes.
     """
 
@@ -50,6 +51,7 @@ class Kept(NamedTuple):
     last: np.ndarray
     distance: np.ndarray
     weight: np.ndarray
+    ended: np.ndarray
     evidence: np.ndarray
 
     def of(self, rows: np.ndarray) -> Kept:
@@ -180,14 +182,16 @@ class Visitors:
         """Bricks as they are."""
         count = len(place)
         row = self.bricks.table[tuple((place - self.bricks.corner).T)] if count else np.empty(0, np.int32)
-        distance, weight = (np.zeros((count, SIDE**3), dtype=np.float32) for _ in range(2))
+        distance, weight, ended = (np.zeros((count, SIDE**3), dtype=np.float32) for _ in range(3))
         distance[row >= 0] = self.bricks.distance[row[row >= 0]]
         weight[row >= 0] = self.bricks.weight[row[row >= 0]]
+        ended[row >= 0] = self.bricks.ended[row[row >= 0]]
         evidence = np.empty((0, NODES, NODES, NODES), dtype=np.uint8)
         if count:
             _, seen, nodes = self._evidence(place)
             evidence = seen[nodes]
-        return Kept(place, np.full(count, np.inf), np.full(count, float(now)), distance, weight, evidence)
+        first, last = np.full(count, np.inf), np.full(count, float(now))
+        return Kept(place, first, last, distance, weight, ended, evidence)
 
     def _evidence(
         self, place: Int[np.ndarray, "n 3"]
@@ -207,6 +211,7 @@ class Visitors:
         nearer = np.where(weight > 0, now < before - 0.5 * self.bricks.voxel, now < BEFORE)
         self.bricks.distance[row] = np.where(nearer, before, now)
         self.bricks.weight[row] = np.where(nearer, weight, self.bricks.weight[row])
+        self.bricks.ended[row] = np.where(nearer, back.ended[there], self.bricks.ended[row])
         begin, seen, nodes = self._evidence(back.place)
         seen[nodes] = np.maximum(seen[nodes], back.evidence)
         begin = begin - self.lattice.corner

@@ -24,10 +24,12 @@ from isdf.cli import main
 from isdf.datasets import SequenceWriter
 from isdf.evaluation import roc_area
 from isdf.mapping import refresh
+from isdf.mapping.bricks import BrickVolume
 from isdf.mapping.completion import CHANNELS, load_network
 from isdf.mapping.evidence import gather
+from isdf.mapping.fusion import HIDDEN, fuse
 from isdf.mapping.nearest import nearest_points
-from isdf.mapping.seeds import surface_seeds
+from isdf.mapping.seeds import ENDED, surface_seeds
 from isdf.methods import load_map
 from tests.gradients import assert_gradient_matches
 from tests.isdf.rooms import box, furnished_orbit, furnished_room, look_at, render, union
@@ -364,3 +366,33 @@ def test_an_image_with_one_pixel_left_is_no_error_wherever_that_is():
     mapper = Mapper()
     mapper.integrate(DepthFrame(depth, torch.eye(4), camera))
     assert mapper.frames_seen == 1
+
+
+def fused_wall():
+    """A brick before and behind a wall at z = 0.08 m, which a camera at z = -1 m looks at."""
+    bricks = BrickVolume(0.02, 1_000)
+    bricks.include(np.zeros(3), np.full(3, 0.1))
+    bricks.add(-bricks.corner[None])
+    depth = np.full((60, 80), 1.08, dtype=np.float32)
+    pose = np.eye(4)
+    pose[2, 3] = 1.0
+    intrinsics = (80.0, 80.0, 39.5, 29.5)
+    shape = np.array(bricks.table.shape)
+    fuse(bricks.arrays, 0 * shape, shape, depth, depth, 0.012, 0.1, 20.0, intrinsics, pose)
+    return bricks
+
+
+def test_a_view_is_evidence_of_a_surface_where_it_ends_and_less_behind():
+    ended = fused_wall().ended[0].reshape(8, 8, 8)
+    assert (ended[..., 4] == 1).all()  # at the wall
+    assert (ended[..., :3] == 0).all()  # seen through
+    np.testing.assert_allclose(ended[..., 6:], HIDDEN)
+
+
+def test_no_surface_is_where_few_views_end():
+    """Where space hidden behind an edge borders on space seen through the fused distances cross zero, too."""
+    bricks = fused_wall()
+    bricks.ended[0].reshape(8, 8, 8)[:4] = 0.9 * ENDED
+    seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(np.zeros(3), np.full(3, 0.1)))
+    assert len(seeds) > 0 and (seeds[:, 0] > 0.07).all()
+    np.testing.assert_allclose(seeds[:, 2], 0.08, atol=1e-4)
