@@ -43,7 +43,7 @@ BEYOND_ACROSS, BEYOND_ALONG = 2.5, 1.5
 # Distances are written anew this far outside what a frame looked at [m].
 MARGIN = 0.8
 # A frame is passed over when more than this share of its points contradicts the map, of those that can be judged by it,
-# which must be this share of all, unless its pose is where the motion leads: then somebody stands before the camera.
+# which must be this share of all, unless its pose is confirmed by the motion: then somebody stands before the camera.
 # And no more than so many frames in a row: then the world has changed, not the frame.
 CONTRADICTED, JUDGED, PATIENCE = 0.35, 0.25, 5
 # Columns of an image that are compared with the map.
@@ -227,12 +227,12 @@ class Mapper(ShownMapper):
             self.lattice.arrays, self.bricks.arrays, depth, stride, _intrinsics(frame), T
         )
         moment = Moment(depth, _intrinsics(frame), T, frame.time)
-        away = self._motion.away(moment, stride)
+        verdict = self._motion.judge(moment, stride)
         complaint = ""
-        if judged > JUDGED and contradicted > CONTRADICTED and not self._motion.leads_to(moment):
+        if judged > JUDGED and contradicted > CONTRADICTED and not verdict.confirmed:
             complaint = f"{100 * contradicted:.0f} % of the depth image contradict the map"
-        elif away is not None:
-            complaint = f"the depth image fits the last one {100 * away:.0f} cm from its pose"
+        elif verdict.away is not None:
+            complaint = f"the depth image fits the last one {100 * verdict.away:.0f} cm from its pose"
         if not complaint:
             self._refused = 0
             return appeared

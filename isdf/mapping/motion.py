@@ -42,6 +42,18 @@ class Moment(NamedTuple):
     time: float
 
 
+class Verdict(NamedTuple):
+    """What the motion says of a frame's pose.
+
+    Args:
+        away: how far [m] from its pose the image fits clearly better; None where its pose is as good as any.
+        confirmed: whether the pose is where the motion leads, or the image fits clearly better at it than there.
+    """
+
+    away: float | None
+    confirmed: bool
+
+
 class Motion:
     """Remembers the last two frames that were believed, and judges the pose of the next one by them."""
 
@@ -53,25 +65,20 @@ class Motion:
         """Go on from this frame."""
         self._before, self._last = self._last, moment
 
-    def away(self, moment: Moment, stride: int) -> float | None:
-        """How far [m] from its pose a frame fits clearly better; None where its pose is as good as any.
-
-        Args:
-            moment: the new frame.
-            stride: every so many pixels is looked at.
-        """
-        if self._last is None or self.leads_to(moment):
-            return None
+    def judge(self, moment: Moment, stride: int) -> Verdict:
+        """Judge the pose of a new frame; every `stride`-th pixel is looked at."""
+        if self._last is None:
+            return Verdict(None, False)
         expected = self._expected(moment.time)
+        if _close(expected, moment.pose):
+            return Verdict(None, True)
         claimed = self._disagreement(moment, moment.pose, stride)
         other = self._disagreement(moment, expected, stride)
-        if claimed is None or other is None or claimed < max(TIMES * other, other + WORSE):
-            return None
-        return float(np.linalg.norm(expected[:3, 3] - moment.pose[:3, 3]))
-
-    def leads_to(self, moment: Moment) -> bool:
-        """Whether the pose of a frame is where the motion of the last ones leads."""
-        return self._last is not None and _close(self._expected(moment.time), moment.pose)
+        if claimed is None or other is None:
+            return Verdict(None, False)
+        jumped = claimed >= max(TIMES * other, other + WORSE)
+        away = float(np.linalg.norm(expected[:3, 3] - moment.pose[:3, 3])) if jumped else None
+        return Verdict(away, claimed <= other - WORSE)
 
     def _expected(self, when: float) -> Float[np.ndarray, "4 4"]:
         """The pose that the motion between the last two frames leads to."""
