@@ -160,6 +160,7 @@ def episode(task: NavigationTask) -> dict:
     loop = ReplanningLoop(
         ride.robot, ride.body, ride.mapper, ride.field_for_driving, config, ride.clock(), watch, task.number,
         ride.monitor,
+        ride.spheres,
     )  # fmt: skip
     drive = loop.drive_to(np.array(task.goal))
     contacts = ride.contacts()

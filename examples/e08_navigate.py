@@ -57,6 +57,7 @@ def main(options: Drive) -> DriveReport:
             episode.clock(),  # what computing costs the robot in time
             watch,
             monitor=episode.monitor,  # has the last word on every command
+            footprint=episode.spheres,  # no camera sees where its own robot is
         )
         report = loop.drive_to(goal)
     print(

@@ -183,6 +183,7 @@ class GraspEpisode:
             self.watch,
             self.options.seed,
             episode.monitor,
+            episode.spheres,
         )
         report = loop.drive_to(place[:2], final_yaw=float(place[2]))
         self.drive = report if self.drive is None else self.drive.joined(report)

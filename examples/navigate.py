@@ -69,6 +69,7 @@ def main(options: Navigate) -> dict:
             watch,
             options.seed,
             episode.monitor,
+            episode.spheres,
         )
         drive = loop.drive_to(goal)
     goal = loop.goal  # in the viewer it can be dragged

@@ -7,6 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
+from jaxtyping import Float
+from numpy import ndarray
+
 from planning.errors import ConfigError
 
 T = TypeVar("T")
@@ -26,6 +29,15 @@ class OnlineMap(Protocol):
 
     def run_for(self, cpu_seconds: float) -> int:
         """Train for some CPU time [s]; returns the number of steps."""
+        ...
+
+
+@runtime_checkable
+class FootprintMap(OnlineMap, Protocol):
+    """A map that can be told where the robot is."""
+
+    def clear_footprint(self, centres: Float[ndarray, "s 3"], radii: Float[ndarray, "s"]) -> None:
+        """Space inside these spheres [m] is free."""
         ...
 
 

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from planning.base_planner import BasePlanner, BasePlannerConfig
-from planning.clock import Clock, MeasuredClock, OnlineMap
-from planning.collision_monitor import CollisionMonitor
+from planning.clock import Clock, FootprintMap, MeasuredClock, OnlineMap
+from planning.collision_monitor import CollisionMonitor, Spheres
 from planning.drive import DriveReport, DriveStatus, MobileRobot
 from planning.errors import ConfigError
 from planning.gaze import Gaze, GazeConfig
@@ -92,6 +92,8 @@ class ReplanningLoop:
         watch: called with the loop after every round, for pictures.
         seed: of the path search.
         monitor: has the last word on every command of the base; it sees an image each control period.
+        footprint: gives the spheres that the robot fills now, centres (s, 3) and radii (s,) [m], for maps that can be
+            told of them: no camera sees where its own robot is.
     """
 
     def __init__(
@@ -105,10 +107,11 @@ class ReplanningLoop:
         watch: Callable[[ReplanningLoop], None] | None = None,
         seed: int = 0,
         monitor: CollisionMonitor | None = None,
+        footprint: Callable[[], Spheres] | None = None,
     ) -> None:
         self.robot, self.mapper, self.snapshot = robot, mapper, snapshot
         self.config, self.clock = config or ReplanningConfig(), clock or MeasuredClock()
-        self.watch, self.monitor = watch, monitor
+        self.watch, self.monitor, self.footprint = watch, monitor, footprint
         self.planner = BasePlanner(body, self.config.planner, seed)
         self.tracker = BaseTracker(self.config.tracker)
         self.gaze = Gaze(robot, self.config.gaze)
@@ -204,6 +207,8 @@ class ReplanningLoop:
                 self.mapper.integrate(frame)
                 self.report.frames += 1
                 self._mapped = True
+                if self.footprint and isinstance(self.mapper, FootprintMap):
+                    self.mapper.clear_footprint(*self.footprint())
             except ValueError as error:
                 logger.warning("frame passed over: %s", error)
                 self.report.frames_refused += 1

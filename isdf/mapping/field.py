@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..field import AnalyticField, check_points
 from .evidence import FREE_ABOVE
+from .lately import Lately
 from .lattice import BLOCK, CHUNK, FINE, STEP, LatticeArrays, node_at
 
 # Below this many points a second thread costs more than it saves.
@@ -34,6 +35,7 @@ class LatticeField(AnalyticField):
         corner: (3,) lattice index of the first node.
         spacing: of coarse nodes [m].
         bounds: (2, 3) lower and upper corner of what was observed [m].
+        lately: where something has come into free space.
 
     The arrays may have rows that belong to the map or to other snapshots: none that this one reads is ever written.
     """
@@ -49,11 +51,12 @@ class LatticeField(AnalyticField):
         corner: Int[np.ndarray, "3"],
         spacing: float,
         bounds: Float[Tensor, "2 3"],
+        lately: Lately,
     ) -> None:
         self._table, self._value, self._confidence = table, value, confidence
         self._block, self._corrections, self._evidence = block, corrections, evidence
         self._origin, self.spacing = np.asarray(corner) * spacing, float(spacing)
-        self.bounds = bounds.clone()
+        self.bounds, self._lately = bounds.clone(), lately
 
     @property
     def nbytes(self) -> int:
@@ -92,6 +95,16 @@ class LatticeField(AnalyticField):
         out = np.empty(len(flat), np.bool_)
         _observed(flat, self._origin, self.spacing, self._table, self._evidence, out)
         return torch.from_numpy(out).to(points.device).view(points.shape[:-1])
+
+    def came(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether a surface at a world point [m] belongs to something that came into free space lately.
+
+        It may move on, and its far side was not seen: distances to it are some centimetres less sure than to others.
+        Always False in a map that forgets nothing (`MapperConfig.visitors`).
+        """
+        check_points(points)
+        near = self._lately.near(points.detach().cpu().numpy().reshape(-1, 3))
+        return torch.from_numpy(near).to(points.device).view(points.shape[:-1])
 
     def _split(self, kernel: Any, points: np.ndarray, distance: np.ndarray, gradient: np.ndarray) -> None:
         """Run a kernel over the points in as many threads as torch uses."""

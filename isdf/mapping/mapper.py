@@ -27,7 +27,9 @@ from .completion import load_network
 from .config import MapperConfig
 from .evidence import look_through
 from .field import LatticeField
+from .footprint import clear
 from .fusion import fuse, nearest_around
+from .lately import Lately
 from .lattice import Lattice
 from .motion import Moment, Motion
 from .refresh import guess, refresh
@@ -135,6 +137,24 @@ class Mapper(ShownMapper):
             self._guessed_at = frame.time
         self._keep_up(T[:3, 3], frame.time)
 
+    def clear_footprint(self, centres: Float[np.ndarray, "s 3"], radii: Float[np.ndarray, "s"]) -> None:
+        """Take note that space inside some spheres [m] is free: where the robot is that carries the camera.
+
+        Its camera does not see there, and without this the map might guess that something stands in it.
+
+        Raises:
+            FrameError: a centre or radius is not finite, or there are not as many of both; the map has not changed.
+        """
+        if centres.shape != (len(radii), 3) or not (np.isfinite(centres).all() and np.isfinite(radii).all()):
+            raise FrameError(
+                "clear_footprint needs finite centres (s, 3) and radii (s,), got shapes "
+                f"{centres.shape} and {radii.shape}"
+            )
+        if self.frames_seen and len(radii):
+            box = clear(self.lattice, centres.astype(float), radii.astype(float))
+            if box is not None:
+                self._touch(box + np.array([[-MARGIN], [MARGIN]]))
+
     def refresh(self) -> None:
         """Bring the distances up to date with all frames so far."""
         if self._viewed is not None and refresh(self.lattice, self.bricks, self._viewed):
@@ -173,6 +193,7 @@ class Mapper(ShownMapper):
             lattice.corner.copy(),
             lattice.spacing,
             self._bounds,
+            self.visitors.lately(),
         )
         lattice.readers.add(snapshot)
         return snapshot
@@ -318,6 +339,7 @@ def compile_kernels() -> None:
         mapper.integrate(frame)
     anywhere, T = np.ones((12, 16), dtype=bool), frame.T_world_camera.numpy()
     intrinsics, none = _intrinsics(frame), np.empty((0, 4), dtype=np.int64)
+    mapper.clear_footprint(np.zeros((1, 3)), np.ones(1))
     mapper.visitors.watch(depth.numpy(), anywhere, 1, intrinsics, T, mapper.up, 1.0, frame.time)
     extend_down(mapper.bricks.arrays, none, *vertical(mapper.up), depth.numpy(), intrinsics, np.linalg.inv(T))
     field = mapper.field()
@@ -325,6 +347,7 @@ def compile_kernels() -> None:
         field.distance_and_gradient(torch.zeros(1, 3, dtype=dtype))
         field.confidence(torch.zeros(1, 3, dtype=dtype))
         field.observed(torch.zeros(1, 3, dtype=dtype))
+        Lately.of(np.zeros((1, 3), dtype=np.int64), 1.0).near(np.zeros((1, 3), np.dtype(str(dtype)[6:])))
 
 
 def _intrinsics(frame: DepthFrame) -> tuple[float, float, float, float]:

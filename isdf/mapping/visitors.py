@@ -18,14 +18,19 @@ from numba import njit
 from scipy.ndimage import binary_dilation
 
 from .bricks import SIDE, Bricks, BrickVolume
+from .departed import looked_past
 from .evidence import FREE_ABOVE, INSIDE
+from .lately import Lately
 from .lattice import Lattice, LatticeArrays, node_at
 from .standing import columns, corners, extend_down, feet, vertical
 
 # Seen in one brick for longer than this [s], something has come to stay. Whoever walks is through in two, but may wait
 # for a robot for a while.
 STAYS = 5.0
-# What is nearer than this to the camera [m] is not taken back: close to its own robot a camera sees little.
+# What has come to stay is still told from what always stood there for this long [s].
+SETTLES = 10.0
+# What is nearer than this to the camera [m] is not taken back unless it has visibly gone: close to its own robot a
+# camera sees little.
 NEAR = 1.2
 # A visitor changes bricks from this far before its surface, the least truncation [m], up to `INSIDE` behind it.
 BEFORE = 0.1
@@ -40,6 +45,7 @@ class Kept(NamedTuple):
         place: (n, 3) lattice index of each.
         first: (n,) when something was seen in it first [s], inf if it only came near.
         last: (n,) when something was seen in it last, or when it was kept [s].
+        past: (n,) when it was seen last that nobody stands in it, see `isdf.mapping.departed` [s], -inf if never.
         distance: (n, 512) float32 [m].
         weight: (n, 512) float32, 0 where nothing was observed.
         ended: (n, 512) float32, see `isdf.mapping.bricks.Bricks`.
@@ -49,6 +55,7 @@ class Kept(NamedTuple):
     place: np.ndarray
     first: np.ndarray
     last: np.ndarray
+    past: np.ndarray
     distance: np.ndarray
     weight: np.ndarray
     ended: np.ndarray
@@ -76,6 +83,7 @@ class Visitors:
         self.bricks, self.lattice, self.memory = bricks, lattice, memory
         self._kept = self._copied(np.empty((0, 3), dtype=np.int64), 0.0)
         self._feet = np.empty((0, 4), dtype=np.int64)
+        self._settled = self._kept
 
     def watch(
         self,
@@ -110,7 +118,7 @@ class Visitors:
         )  # fmt: skip
         visited = pixels != 0
         axis, way = vertical(up)
-        ground = int(np.floor(floor / (SIDE * self.bricks.voxel))) - int(self.bricks.corner[axis])
+        ground = int(np.floor(floor / self._edge)) - int(self.bricks.corner[axis])
         self._feet = feet(pixels, inside, axis, way, ground)
         visited[tuple(columns(self._feet, axis, way).T)] = True
         # Whoever walks on comes into the neighbours next, little by little: keep those, too.
@@ -119,6 +127,9 @@ class Visitors:
         rows = self._table()[visited & inside]
         self._kept.first[rows] = np.minimum(self._kept.first[rows], now)
         self._kept.last[rows] = now
+        seen = np.isfinite(self._kept.first)
+        past = looked_past(self._kept.place, seen, self._edge, depth, intrinsics, T_world_camera, axis)
+        self._kept.past[past] = now
 
     def stand(
         self,
@@ -138,7 +149,7 @@ class Visitors:
         under = np.unique(columns(self._feet, axis, way), axis=0)
         self.bricks.add(under[self.bricks.table[tuple(under.T)] < 0])
         extend_down(self.bricks.arrays, self._feet, axis, way, depth, intrinsics, T_camera_world)
-        return SIDE * self.bricks.voxel * (self.bricks.corner + corners(under))
+        return self._edge * (self.bricks.corner + corners(under))
 
     def take_back(self, eye: Float[np.ndarray, "3"], now: float) -> Float[np.ndarray, "2 3"] | None:
         """Give back the bricks whose visitors have been out of view for long enough.
@@ -151,18 +162,30 @@ class Visitors:
             The box [m] that is to be refreshed, None where nothing has changed.
         """
         kept = self._kept
-        if self.memory is None or len(kept.place) == 0:
+        if self.memory is None or len(kept.place) + len(self._settled.place) == 0:
             return None
         stayed = kept.last - kept.first > STAYS
-        edge = SIDE * self.bricks.voxel
-        near = np.linalg.norm(edge * (kept.place + 0.5) - eye, axis=1) < NEAR
-        gone = ~stayed & ~near & (now - kept.last > self.memory)
+        near = np.linalg.norm(self._edge * (kept.place + 0.5) - eye, axis=1) < NEAR
+        hidden = near & (kept.past <= kept.last)
+        gone = ~stayed & ~hidden & (now - kept.last > self.memory)
         self._kept = kept.of(~stayed & ~gone)
+        settled = self._settled.and_also(kept.of(stayed))
+        self._settled = settled.of(now - settled.last < SETTLES)
         back = kept.of(gone & np.isfinite(kept.first))
         if len(back.place) == 0:
             return None
         self._give_back(back)
-        return edge * corners(back.place)
+        return self._edge * corners(back.place)
+
+    def lately(self) -> Lately:
+        """Where something came and, as far as the camera knows, still is."""
+        seen = self._kept.place[np.isfinite(self._kept.first)]
+        return Lately.of(np.concatenate([seen, self._settled.place]), self._edge)
+
+    @property
+    def _edge(self) -> float:
+        """Of a brick [m]."""
+        return SIDE * self.bricks.voxel
 
     def _table(self) -> Int[np.ndarray, "nx ny nz"]:
         """Row of every brick that is kept, -1 elsewhere; as large as the table of bricks, which never shrinks."""
@@ -190,8 +213,8 @@ class Visitors:
         if count:
             _, seen, nodes = self._evidence(place)
             evidence = seen[nodes]
-        first, last = np.full(count, np.inf), np.full(count, float(now))
-        return Kept(place, first, last, distance, weight, ended, evidence)
+        first, last, past = np.full(count, np.inf), np.full(count, float(now)), np.full(count, -np.inf)
+        return Kept(place, first, last, past, distance, weight, ended, evidence)
 
     def _evidence(
         self, place: Int[np.ndarray, "n 3"]

@@ -49,6 +49,7 @@ def loop_in(episode: Episode, watch) -> ReplanningLoop:
         episode.clock(),
         watch,
         monitor=episode.monitor,
+        footprint=episode.spheres,
     )
 
 

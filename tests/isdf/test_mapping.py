@@ -396,3 +396,27 @@ def test_no_surface_is_where_few_views_end():
     seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(np.zeros(3), np.full(3, 0.1)))
     assert len(seeds) > 0 and (seeds[:, 0] > 0.07).all()
     np.testing.assert_allclose(seeds[:, 2], 0.08, atol=1e-4)
+
+
+def test_space_that_the_robot_fills_is_free_though_it_was_never_seen():
+    mapper = Mapper()
+    centres, radii = torch.tensor([[-1.6, -1.5, 0.2 * n] for n in range(1, 6)]).numpy(), np.full(5, 0.2)
+    mapper.clear_footprint(centres, radii)  # nothing to tell yet
+    watch(mapper, furnished_room(), 0.0, 1.0)
+    inside = torch.from_numpy(centres).float()
+    hidden = mapper.field()
+    mapper.clear_footprint(centres, radii)
+    mapper.refresh()
+    field = mapper.field()
+    assert not hidden.observed(inside).all() and field.observed(inside).all()
+    assert float(field.distance(inside).min()) > max(0.0, float(hidden.distance(inside).min()))
+    far = inside + torch.tensor([0.0, 3.0, 0.0])
+    assert torch.equal(field.distance(far), hidden.distance(far))
+
+
+@pytest.mark.parametrize(("centre", "radius"), [(np.nan, 1.0), (0.0, np.inf)])
+def test_footprints_that_are_none_are_refused(centre, radius):
+    mapper = Mapper()
+    watch(mapper, furnished_room(), 0.0, 0.2)
+    with pytest.raises(FrameError, match="clear_footprint needs finite centres"):
+        mapper.clear_footprint(np.full((1, 3), centre), np.full(1, radius))

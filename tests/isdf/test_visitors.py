@@ -9,6 +9,7 @@ import torch
 
 from isdf import ConfigError, Mapper, MapperConfig, PinholeCamera
 from isdf.mapping.bricks import BrickVolume
+from isdf.mapping.departed import looked_past
 from isdf.mapping.lattice import Lattice
 from isdf.mapping.visitors import Visitors
 from tests.isdf.rooms import box, furnished_room, look_at, render, union
@@ -19,17 +20,17 @@ THERE, ASIDE = (0.3, 0.2, 0.5), (-1.5, 1.2, 0.5)
 FPS = 5
 
 
-def person(x, y):
+def person(x, y, height=1.2):
     """Somebody."""
-    return box((x, y, 0.6), (0.3, 0.3, 1.2))
+    return box((x, y, height / 2), (0.3, 0.3, height))
 
 
-def watch(mapper, at, seconds, place=None):
+def watch(mapper, at, seconds, place=None, height=1.2):
     """Look at a place for a while; somebody may stand there, or walk if `place` is a function of the share of it."""
     start = mapper.frames_seen / FPS
     for n in range(round(seconds * FPS)):
         where = place(n / (seconds * FPS)) if callable(place) else place
-        room = furnished_room() if where is None else union(furnished_room(), person(*where))
+        room = furnished_room() if where is None else union(furnished_room(), person(*where, height))
         # A camera never gives the same image twice.
         eye = (EYE[0] + 0.02 * (n % 3), *EYE[1:])
         mapper.integrate(render(room, look_at(eye, at), CAMERA, start + n / FPS))
@@ -71,12 +72,15 @@ def test_who_walks_out_of_view_is_taken_back():
     assert (during.distance(points) < 0.1).float().mean() > 0.5
     assert (after.distance(points) - before.distance(points)).abs().mean() < 0.02
     assert (after.observed(points) | ~before.observed(points)).float().mean() > 0.98
+    assert during.came(points).float().mean() > 0.8 and not (before.came(points) | after.came(points)).any()
+    assert not during.came(points + torch.tensor([0.0, 1.5, 0.0])).any()
 
 
 def test_a_map_that_never_forgets_keeps_it():
     _, during, after = mapped(None)
     points = around(*LAST)
     assert (after.distance(points) - during.distance(points)).abs().mean() < 0.02
+    assert not during.came(points).any()
 
 
 def test_the_room_stays_as_it_was():
@@ -115,6 +119,11 @@ def test_what_is_seen_to_stay_is_kept():
     watch(mapper, ASIDE, 4.0, LAST)
     points = around(*LAST)
     assert (mapper.field().distance(points) - during.distance(points)).abs().mean() < 0.02
+    assert mapper.field().came(points).float().mean() > 0.8
+    watch(mapper, ASIDE, 9.0, LAST)
+    mapper.refresh()
+    assert (mapper.field().distance(points) - during.distance(points)).abs().mean() < 0.02
+    assert not mapper.field().came(points).any()
 
 
 def test_what_was_never_seen_free_is_no_visitor():
@@ -150,3 +159,37 @@ def test_only_bricks_that_something_came_into_are_given_back(first):
     else:
         np.testing.assert_allclose(box, [[0.32] * 3, [0.64] * 3])
         assert (bricks.weight[0] == 0).all()
+
+
+def test_who_was_close_has_gone_when_the_camera_looks_past_him():
+    """A camera 1.3 m up looks along x; bricks of 32 cm, 60 cm before it, at its height and on the floor."""
+    pose = look_at((0.0, 0.0, 1.3), (1.0, 0.0, 1.3))
+    intrinsics = tuple(float(v) for v in (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy))
+    place = np.array(
+        [[1, 0, 4], [1, 0, 0], [1, -2, 0], [-2, 0, 4]]
+    )  # the third is low, the last behind the camera
+    seen, far, near = np.array([True, False, True, True]), np.full((48, 64), 3.0), np.full((48, 64), 0.9)
+
+    def past(depth, seen=seen):
+        return looked_past(place, seen, 0.32, depth, intrinsics, pose, axis=2).tolist()
+
+    assert past(far) == [True, True, False, False]
+    assert past(near) == [False] * 4, "somebody may hide behind what is close"
+    assert past(0 * far) == [False] * 4
+    assert past(far, np.array([False, True, True, True])) == [False] * 4, "it was never seen to be tall"
+
+
+def test_who_stood_close_is_taken_back_once_the_camera_looks_past_him():
+    place, changed = (EYE[0] + 0.6, EYE[1] + 0.6), []
+    points = around(*place) - torch.tensor([0.0, 0.0, 0.4])
+    for away, still in ((THERE, None), ((EYE[0] - 1.0, EYE[1]), place)):
+        mapper = Mapper(MapperConfig(visitors=2.0))
+        watch(mapper, THERE, 2.0)
+        before = mapper.field().distance(points)
+        watch(mapper, (*place, EYE[2]), 0.8, place, 1.7)
+        mapper.refresh()
+        assert mapper.field().came(points).any()
+        watch(mapper, (*away[:2], EYE[2]), 3.0, still, 1.7)
+        mapper.refresh()
+        changed.append(float((mapper.field().distance(points) - before).abs().mean()))
+    assert changed[0] < 0.02 and changed[1] > 0.05, changed

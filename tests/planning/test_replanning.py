@@ -11,7 +11,7 @@ import pytest
 
 from planning import ChompConfig, ConfigError
 from planning.base_planner import BasePlannerConfig
-from planning.clock import FixedClock, OnlineMap
+from planning.clock import FixedClock, FootprintMap, OnlineMap
 from planning.drive import DriveReport, DriveStatus, MobileRobot
 from planning.grid_search import GridSearchConfig
 from planning.replanning import ReplanningConfig, ReplanningLoop
@@ -241,6 +241,25 @@ def test_looks_round_first_and_then_where_it_goes() -> None:
             toward = np.arctan2(*(target[:2] - state[:2])[::-1])
             assert abs(toward - np.arctan2(*(GOAL - state[:2])[::-1])) < 0.3
             assert 0.8 < np.linalg.norm(target[:2] - state[:2]) < 2.0
+
+
+def test_a_map_that_can_be_told_is_told_where_the_robot_is() -> None:
+    robot, told = Unicycle(), []
+
+    class Told(TaughtMap):
+        def clear_footprint(self, centres, radii):
+            told.append((centres, radii))
+
+    def fills():
+        return np.array([[*robot.state[:2], 0.3]]), np.array([0.25])
+
+    mapper = Told(lambda: FREE)
+    assert isinstance(mapper, FootprintMap) and not isinstance(TaughtMap(lambda: FREE), FootprintMap)
+    report = ReplanningLoop(robot, BODY, mapper, mapper.snapshot, QUICK, CLOCK, footprint=fills).drive_to(
+        GOAL
+    )
+    assert report.success and len(told) == report.frames
+    assert told[0][0][0, 0] == 0.0 and abs(told[-1][0][0, 0] - GOAL[0]) < 0.2
 
 
 def test_an_empty_report_is_no_success() -> None:
