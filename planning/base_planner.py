@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -38,6 +39,8 @@ class BasePlannerConfig:
         memory_came: the same [s] for space that was free before: what came there may go again.
         stand_off: distance [m] to keep from what came into the way, to see all of it down to the floor, and to let it
             pass; and from other blocked space when it looks at it for the last time.
+        wary: clearance [m] that is kept, on top of all others, from what came lately: it may move on, and its far side
+            was not seen.
         room: unknown space this near [m] to the axis of the base, where it was put down, counts as free: a camera on
             the robot does not see the floor round its feet. Later on only the space that the base has been in does.
     """
@@ -61,19 +64,23 @@ class BasePlannerConfig:
     memory: float = 30.0
     memory_came: float = 10.0
     stand_off: float = 1.0
+    wary: float = 0.03
     room: float = 0.5
 
     def __post_init__(self) -> None:
-        low = self.num_waypoints < 3 or self.looks < 1
-        if (
-            low
-            or not min(self.clearance_change, self.off_path, self.memory, self.memory_came, self.room) > 0
-            or not self.stand_off >= 0
-            or not self.margin >= self.search.least_margin
-        ):
+        positive = (self.clearance_change, self.off_path, self.memory, self.memory_came, self.room)
+        good = (
+            all(value > 0 for value in positive)  # NaN is not
+            and self.stand_off >= 0
+            and self.wary >= 0
+            and self.num_waypoints >= 3
+            and self.looks >= 1
+            and self.margin >= self.search.least_margin
+        )
+        if not good:
             raise ConfigError(
                 "BasePlannerConfig: clearance_change, off_path, memory, memory_came and room must be positive, "
-                "stand_off not negative, num_waypoints at least 3, looks at least 1 and margin at least "
+                "stand_off and wary not negative, num_waypoints at least 3, looks at least 1 and margin at least "
                 f"search.least_margin, got {self}."
             )
 
@@ -204,13 +211,13 @@ class BasePlanner:
         if _gap(waypoints[max(0, nearest - 1) : nearest + 2], position) > self.config.off_path:
             return False
         left = Trajectory.through(torch.cat([position[None], waypoints[nearest + 1 :]]))
-        clearance = check(self.body, left, sdf, self.config.chomp.validation).clearance
+        clearance = check(self.body, left, self._explored(sdf), self.config.chomp.validation).clearance
         return clearance >= min(self.config.margin, plan.clearance) - self.config.clearance_change
 
     def _explored(self, sdf: DistanceField) -> DistanceField:
         """The field with what it has not seen as unknown; the field itself where it does not tell."""
         if isinstance(sdf, ObservingField | ConfidentField):
-            return ExploredField(sdf, self._trodden)
+            return ExploredField(sdf, self._trodden, self.config.wary)
         return sdf
 
     def _optimised(self, route: Route, sdf: DistanceField) -> PlanResult:
@@ -218,24 +225,22 @@ class BasePlanner:
 
         The clearance asked for is what the route has, at most the margin; the cost still seeks more.
         """
-        config = self.config
+        config, began = self.config, time.perf_counter()
         path = Trajectory.through(route.path)
         found = check(self.body, path, sdf, config.chomp.validation)
-        margin = min(config.margin, found.clearance - 0.005)
-        validation = replace(config.chomp.validation, margin=margin)
-        chomp = Chomp(self.body, replace(config.chomp, validation=validation), self.seed)
-        guess = Trajectory.through(route.path, config.num_waypoints) if len(path) > 1 else path
-        result = chomp.optimise(guess, sdf)
-        if result.success and self._stays_in_seen_space(result.trajectory, sdf):
-            return result
+        validation = replace(config.chomp.validation, margin=min(config.margin, found.clearance - 0.005))
+        start = check(self.body, Trajectory.through(route.path[:1]), sdf, config.chomp.validation)
+        # Where the robot stands too close already, only the search knows where it may be as close again.
+        if start.clearance >= config.search.least_margin:
+            chomp = Chomp(self.body, replace(config.chomp, validation=validation), self.seed)
+            guess = Trajectory.through(route.path, config.num_waypoints) if len(path) > 1 else path
+            result = chomp.optimise(guess, sdf)
+            if result.success and self._stays_in_seen_space(result.trajectory, sdf):
+                return result
         verdict = check(self.body, path, sdf, validation)
-        return replace(
-            result,
-            trajectory=path,
-            status=verdict.status,
-            message=f"the searched route: {verdict.message}",
-            clearance=verdict.clearance,
-        )
+        message = f"the searched route: {verdict.message}"
+        seconds = time.perf_counter() - began
+        return PlanResult(path, verdict.status, message, verdict.clearance, (), 0, seconds)
 
     def _stays_in_seen_space(self, path: Trajectory, sdf: DistanceField) -> bool:
         """Whether a path enters no unknown space, by the rules of the search."""

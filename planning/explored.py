@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 from numba import njit
 from torch import Tensor
 
-from planning.protocols import ConfidentField, ObservingField
+from planning.protocols import ChangingField, ConfidentField, ObservingField
+from planning.workspace import MIN_FLOOR_SLOPE
 
 # From this confidence on a place counts as seen, in maps that say no more of it.
 SEEN = 0.5
@@ -45,31 +46,48 @@ class ExploredField:
     """A distance field with confidence 1 where the base may drive and 0 in space nobody has looked at.
 
     A camera on the robot never sees the space that the robot stands in, but the robot does stand there; so its trail
-    counts as seen.
+    counts as seen. What came lately counts as nearer than it was seen to be, in fields that know of it.
 
     Args:
         field: distances; it tells what was seen by `observed`, or else by `confidence`.
         trodden: where the base has been; what is added to it later counts as well.
+        wary: how much nearer [m] what came lately is than the field says.
     """
 
-    def __init__(self, field: ObservingField | ConfidentField, trodden: Trodden) -> None:
-        self.field, self.trodden = field, trodden
+    def __init__(self, field: ObservingField | ConfidentField, trodden: Trodden, wary: float = 0.0) -> None:
+        self.field, self.trodden, self.wary = field, trodden, wary
 
     def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Signed distances [m] of the field."""
-        return self.field.distance(points)
+        """Signed distances [m] of the field, to what came as well as to all else."""
+        if not self._is_wary:
+            return self.field.distance(points)
+        exact, gradient = self.field.distance_and_gradient(points)
+        distance = self.field.distance(points) if points.requires_grad else exact
+        return distance - self._nearer(points, exact, gradient)
 
     def distance_and_gradient(
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Signed distances [m] of the field and their gradients."""
-        return self.field.distance_and_gradient(points)
+        """The same and their gradients."""
+        distance, gradient = self.field.distance_and_gradient(points)
+        return distance - self._nearer(points, distance, gradient) if self._is_wary else distance, gradient
 
     def confidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """1 where a point [m] was looked at or is trodden, else 0."""
         seen = self._observed(points).cpu().numpy().ravel()
         _add_trodden(points.detach().cpu().numpy().reshape(-1, 3), self.trodden.low, self.trodden.cells, seen)
         return torch.from_numpy(seen).to(points).view(points.shape[:-1])
+
+    @property
+    def _is_wary(self) -> bool:
+        return self.wary > 0 and isinstance(self.field, ChangingField)
+
+    def _nearer(self, points: Tensor, distance: Tensor, gradient: Tensor) -> Float[Tensor, "*batch"]:
+        """How much nearer than `distance` something is to points [m]."""
+        assert isinstance(self.field, ChangingField)
+        came = self.field.came(points.detach() - distance.unsqueeze(-1) * gradient)
+        # The floor, on which everybody stands, has not come.
+        return self.wary * (came & (gradient[..., 2] <= MIN_FLOOR_SLOPE))
 
     def _observed(self, points: Tensor) -> Bool[Tensor, "*batch"]:
         if isinstance(self.field, ObservingField):

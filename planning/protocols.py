@@ -47,6 +47,15 @@ class ObservingField(DistanceField, Protocol):
 
 
 @runtime_checkable
+class ChangingField(DistanceField, Protocol):
+    """A distance field that knows where something has come lately, such as somebody who walks about."""
+
+    def came(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether surfaces at points [m] belong to something that came lately; its far side was not seen."""
+        ...
+
+
+@runtime_checkable
 class CostField(Protocol):
     """An obstacle cost c(f(x) - r) over a distance field f, as in CHOMP (Zucker et al. 2013, section 3.2)."""
 

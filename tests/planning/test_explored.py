@@ -16,10 +16,11 @@ from planning.drive import DriveStatus
 from planning.explored import ExploredField, Trodden
 from planning.gaze import GazeConfig
 from planning.grid_search import GridSearchConfig, grid_search
-from planning.protocols import ObservingField
+from planning.protocols import ChangingField, ObservingField
 from planning.replanning import ReplanningLoop
+from planning.trajectory import Trajectory
 from planning.workspace import WorkspaceConfig
-from tests.planning.fields import AutogradField, Box, Confident
+from tests.planning.fields import AutogradField, Box, Confident, Cylinder, Union
 from tests.planning.test_replanning import BODY, FREE, QUICK, drive
 from tests.planning.unicycles import Unicycle
 
@@ -221,6 +222,65 @@ def test_bad_ways_of_looking_are_refused(values: dict) -> None:
 def test_bad_memories_are_refused(values: dict) -> None:
     with pytest.raises(Exception, match=next(iter(values))):
         BasePlannerConfig(**values)
+
+
+@dataclass
+class Visited(Observed):
+    """Something has come where x is greater than a limit [m]."""
+
+    limit: float = 0.0
+
+    def came(self, points: Tensor) -> Tensor:
+        return points[..., 0] > self.limit
+
+
+FLOOR = Box((0.0, 0.0, -1.0), (30.0, 30.0, 1.0))
+EVERYWHERE = (torch.zeros(1, 2), 99.0)
+
+
+def test_what_came_counts_as_nearer() -> None:
+    walls = Box((2.0, 0.0, 0.5), (0.3, 9.0, 1.0)), Box((-2.0, 0.0, 0.5), (0.3, 9.0, 1.0)), FLOOR
+    field = Visited(Union(*walls), *EVERYWHERE, limit=1.0)
+    assert isinstance(field, ChangingField)
+    points = torch.tensor(
+        [[-0.2, 0.0, 2.0], [0.2, 0.0, 2.0], [1.5, 0.0, 0.1]]
+    )  # the last is nearest to the floor
+    wary = ExploredField(field, trodden(), 0.08)
+    for distance in (wary.distance(points), wary.distance_and_gradient(points)[0]):
+        torch.testing.assert_close(distance, field.distance(points) - torch.tensor([0.0, 0.08, 0.0]))
+    wary.distance(points.requires_grad_()).sum().backward()
+    torch.testing.assert_close(points.grad, wary.distance_and_gradient(points)[1])
+    assert torch.equal(wary.distance_and_gradient(points)[1], field.distance_and_gradient(points)[1])
+    assert torch.equal(ExploredField(field, trodden()).distance(points), field.distance(points))
+
+
+GAP = Union(Box((2.0, 5.3, 0.5), (0.15, 5.0, 1.0)), Box((2.0, -5.3, 0.5), (0.15, 5.0, 1.0)))
+"""60 cm between two walls, for a base of 50 cm."""
+
+
+WARY = BasePlannerConfig(wary=0.08)
+
+
+def test_no_passing_close_to_what_came() -> None:
+    goal = torch.tensor([4.0, 0.0])
+    for limit, fits in ((99.0, True), (1.0, False)):
+        assert (
+            BasePlanner(BODY, WARY).plan(START, goal, Visited(GAP, *EVERYWHERE, limit)).reaches_goal == fits
+        )
+    planner = BasePlanner(BODY, WARY)
+    through = planner.plan(START, goal, Visited(GAP, *EVERYWHERE, 99.0)).result
+    assert planner.still_good(through, START, Visited(GAP, *EVERYWHERE, 99.0))
+    assert not planner.still_good(through, START, Visited(GAP, *EVERYWHERE, 1.0))
+
+
+def test_who_stands_too_close_to_what_came_drives_off_and_keeps_off_the_rest() -> None:
+    start = torch.tensor([1.43, 0.0])  # 2 cm before what came
+    pillar = Cylinder((0.3, 0.2), 0.3)
+    field = Visited(Union(Box((2.0, 0.0, 0.5), (0.3, 30.0, 1.0)), pillar), *EVERYWHERE, limit=1.2)
+    plan = BasePlanner(BODY, WARY).plan(start, torch.tensor([-1.5, 0.2]), field)
+    assert plan.usable and plan.reaches_goal and "searched route" in plan.result.message
+    path = Trajectory.through(plan.result.trajectory.waypoints, 200).waypoints
+    assert float((path - torch.tensor([0.3, 0.2])).norm(dim=1).min()) - 0.55 > -0.005
 
 
 def test_the_trail_grows_every_way_and_forgets_nothing() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -98,12 +99,22 @@ def test_what_came_and_stays_is_given_up() -> None:
     robot = Unicycle()
     config = replace(QUICK, planner=BasePlannerConfig(), time_limit=200.0)
     shut = Box((2.0, 0.0, 0.5), (0.3, 1000.0, 1.0))
-    _, report = drive(robot, lambda: shut if robot.time > 6.0 else FREE, config, goal=GOAL.double().numpy())
+    # It comes before the robot is where it comes to.
+    _, report = drive(robot, lambda: shut if robot.time > 4.5 else FREE, config, goal=GOAL.double().numpy())
     assert report.status is DriveStatus.UNREACHABLE, report.message
     assert robot.state[0] < 1.0
 
 
-@pytest.mark.parametrize("values", [{"memory_came": 0.0}, {"stand_off": -0.1}])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"memory_came": 0.0},
+        {"memory_came": math.nan},
+        {"stand_off": -0.1},
+        {"wary": -0.01},
+        {"wary": math.nan},
+    ],
+)
 def test_bad_ways_of_waiting_are_refused(values: dict) -> None:
     with pytest.raises(Exception, match=next(iter(values))):
         BasePlannerConfig(**values)
