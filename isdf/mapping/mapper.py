@@ -143,12 +143,14 @@ class Mapper(ShownMapper):
         Its camera does not see there, and without this the map might guess that something stands in it.
 
         Raises:
-            FrameError: a centre or radius is not finite, or there are not as many of both; the map has not changed.
+            FrameError: a centre is not finite, a radius not finite and positive, or there are not as many of both; the
+                map has not changed.
         """
-        if centres.shape != (len(radii), 3) or not (np.isfinite(centres).all() and np.isfinite(radii).all()):
+        good = np.isfinite(centres).all() and np.isfinite(radii).all() and (radii > 0).all()
+        if centres.shape != (len(radii), 3) or not good:
             raise FrameError(
-                "clear_footprint needs finite centres (s, 3) and radii (s,), got shapes "
-                f"{centres.shape} and {radii.shape}"
+                "clear_footprint needs finite centres (s, 3) and positive radii (s,), got shapes "
+                f"{centres.shape} and {radii.shape}, radii from {radii.min(initial=np.inf):g} m"
             )
         if self.frames_seen and len(radii):
             box = clear(self.lattice, centres.astype(float), radii.astype(float))

@@ -410,11 +410,12 @@ def test_space_that_the_robot_fills_is_free_though_it_was_never_seen():
     field = mapper.field()
     assert not hidden.observed(inside).all() and field.observed(inside).all()
     assert float(field.distance(inside).min()) > max(0.0, float(hidden.distance(inside).min()))
+    mapper.clear_footprint(centres + 100.0, radii)  # outside the map there is nothing to tell
     far = inside + torch.tensor([0.0, 3.0, 0.0])
     assert torch.equal(field.distance(far), hidden.distance(far))
 
 
-@pytest.mark.parametrize(("centre", "radius"), [(np.nan, 1.0), (0.0, np.inf)])
+@pytest.mark.parametrize(("centre", "radius"), [(np.nan, 1.0), (0.0, np.inf), (0.0, -0.1)])
 def test_footprints_that_are_none_are_refused(centre, radius):
     mapper = Mapper()
     watch(mapper, furnished_room(), 0.0, 0.2)

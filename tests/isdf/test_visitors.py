@@ -10,6 +10,7 @@ import torch
 from isdf import ConfigError, Mapper, MapperConfig, PinholeCamera
 from isdf.mapping.bricks import BrickVolume
 from isdf.mapping.departed import looked_past
+from isdf.mapping.lately import Lately
 from isdf.mapping.lattice import Lattice
 from isdf.mapping.visitors import Visitors
 from tests.isdf.rooms import box, furnished_room, look_at, render, union
@@ -159,6 +160,14 @@ def test_only_bricks_that_something_came_into_are_given_back(first):
     else:
         np.testing.assert_allclose(box, [[0.32] * 3, [0.64] * 3])
         assert (bricks.weight[0] == 0).all()
+
+
+def test_what_belongs_to_something_that_came_may_lie_a_little_beside_its_bricks():
+    lately = Lately.of(np.array([[1, 0, -2], [5, 0, -2]]), 0.32)  # the first from x = 0.32 to 0.64
+    x = np.array([0.2, 0.23, 0.4, 0.73, 0.75, 1.65, np.nan])
+    points = np.stack([x, np.full(7, 0.1), np.full(7, -0.5)], axis=1)
+    assert lately.near(points).tolist() == [False, True, True, True, False, True, False]
+    assert not Lately.of(np.empty((0, 3), dtype=np.int64), 0.32).near(points).any()
 
 
 def test_who_was_close_has_gone_when_the_camera_looks_past_him():
