@@ -5,7 +5,7 @@
     python -m benchmarks.closed_loop navigate --method exact --backend dask --cluster tcp://host:8786
     python -m benchmarks.closed_loop grasp --objects FOLDER --episodes 50 --out runs/grasps
 
-Every episode leaves report.json, summary.png and states.npz (time, base pose, joint positions, poses of everything that
+Every episode leaves report.json, summary.png and states.npz (time, base pose, joint positions, head, poses of all that
 moves) in OUT/SCENE/METHOD/DISTURBANCE/NUMBER or OUT/OBJECTS/METHOD/NUMBER, the summary is OUT/summary.md. Contacts are
 counted twice: by the physics while it runs, and from the recorded states in a fresh world.
 """

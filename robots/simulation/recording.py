@@ -24,6 +24,7 @@ class Recording:
         """Time [s] and contact of every robot link with every body, of all steps."""
         self._times: list[float] = []
         self._postures: list[np.ndarray] = []
+        self._heads: list[list[float]] = []
         self._at_start = world.solids
         self._movers = {name: None for name, solid in self._at_start.items() if solid.mass > 0}
         self._poses: list[dict[str, np.ndarray]] = []
@@ -35,6 +36,8 @@ class Recording:
         """Record where everything is now, and what touched since the last step of physics."""
         self._times.append(self.world.time)
         self._postures.append(self.world.robot_state()[0])
+        robot = self.world.robot
+        self._heads.append([robot.joint_position(name) for name in robot.head_joints])
         solids = self.world.solids
         # The world replaces a static solid that is put elsewhere.
         self._movers |= {
@@ -72,9 +75,10 @@ class Recording:
     def save(self, path: str | Path) -> None:
         """Write the states to an .npz file.
 
-        It holds time (n,) [s], joint_names, joint_positions (n, dof), object_names, object_poses (n, k, 4, 4) [m],
-        and base_pose (n, 3) [m, m, rad] where the robot has a base. Objects are the solids with a mass and those that
-        were moved or added, NaN while they are not in the world.
+        It holds time (n,) [s], joint_names, joint_positions (n, dof), object_names, object_poses (n, k, 4, 4) [m];
+        base_pose (n, 3) [m, m, rad] where the robot has a base; and where it has a head head_joints and head_positions
+        (n, 2) [rad], with which `robots.Robot.camera_pose` tells where the camera was. Objects are the solids with a
+        mass and those that were moved or added, NaN while they are not in the world.
         """
         names = self.world.robot.joint_names
         times, postures = self.postures()
@@ -87,6 +91,11 @@ class Recording:
         }
         if names[:3] == ("base_x", "base_y", "base_yaw"):
             arrays["base_pose"] = postures[:, :3]
+        if head := self.world.robot.head_joints:
+            arrays |= {
+                "head_joints": np.array(head),
+                "head_positions": np.array(self._heads).reshape(-1, len(head)),
+            }
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
     def _object_poses(self) -> Float[np.ndarray, "n k 4 4"]:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 import robots
 from robots import RobotError
@@ -66,6 +67,21 @@ def test_look_at_goes_as_far_as_the_neck(put) -> None:
     axis = robot.camera.pose()[:3, 2]
     assert math.atan2(axis[1], axis[0]) > 1.0, "turned to the left as far as it goes"
     assert off_axis(robot, behind) > 0.5
+
+
+def test_recorded_states_tell_where_the_camera_was(put, tiago, tmp_path) -> None:
+    robot, poses = put(pose=(0.5, -0.3, 0.4)), []
+    for point in ((2.0, 0.9, 0.0), (1.5, -1.5, 1.1)):
+        robot.look_at(np.array(point))
+        robot.drive(0.1, 0.2, 1.0)
+        poses.append(robot.camera.pose())
+    robot.recording.save(tmp_path / "states.npz")
+    with np.load(tmp_path / "states.npz") as saved:
+        states = dict(saved)
+    assert tuple(states["head_joints"]) == tiago.head_joints
+    for q, head, pose in zip(states["joint_positions"], states["head_positions"], poses, strict=True):
+        found = tiago.camera_pose(torch.as_tensor(q, dtype=torch.float32), head.tolist())
+        np.testing.assert_allclose(found, pose, atol=1e-3)
 
 
 def test_observe_leaves_nothing_of_the_robot(put, tiago) -> None:
@@ -151,6 +167,8 @@ def test_the_recording_is_what_happened(put, tmp_path, tiago) -> None:
             "object_names",
             "object_poses",
             "base_pose",
+            "head_joints",
+            "head_positions",
         }
         np.testing.assert_array_equal(saved["time"], times)
         np.testing.assert_array_equal(saved["joint_positions"], states)
