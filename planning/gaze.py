@@ -1,11 +1,13 @@
-"""Where a driving robot looks: along its path, and nodding, since no camera sees from its feet to its head at once."""
+"""Where a driving robot looks: along its path, nodding, since no camera sees from its feet to its head at once.
+
+In between it looks at those who stand about, see `planning.bystanders`.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -14,12 +16,14 @@ from numpy import ndarray
 from planning.drive import MobileRobot
 from planning.errors import ConfigError
 
-T = TypeVar("T")
-
 # A path shorter than this [m] is at its end: what counts is what lies ahead.
 AT_THE_END = 0.5
 # The camera looks at what is within this angle of the way the base faces [rad].
 FACING = 0.3
+# The neck turns so far [rad] that what is beside the robot comes into view, at least at the edge.
+NECK = 1.6
+# Height [m] at which those who stand about are looked at.
+CHEST = 1.0
 
 
 @dataclass(frozen=True)
@@ -27,24 +31,23 @@ class GazeConfig:
     """What the camera looks at.
 
     Args:
-        ahead: distance along the path [m].
-        heights: heights [m] there between which it nods, to see both what stands on the floor and what hangs as high as
-            the robot's head.
+        looks: distances along the path and heights there [m] between which it nods: at the floor that comes next, where
+            it also sees who steps into the way from beside, and at what hangs as high as the robot's head.
         near: distance [m] at which it looks at the floor, too, while the base turns on the spot: to see where it could
             drive off.
-        nod: time [s] at each of them.
+        nod: time [s] of each look.
     """
 
-    ahead: float = 1.5
-    heights: tuple[float, ...] = (0.0, 1.1)
+    looks: tuple[tuple[float, float], ...] = ((1.0, 0.0), (1.5, 1.1))
     near: float = 0.7
     nod: float = 0.5
 
     def __post_init__(self) -> None:
-        if not self.heights or not min(self.ahead, self.near, self.nod) > 0:
+        positive = [self.near, self.nod, *(distance for distance, _ in self.looks)]
+        if not self.looks or not all(value > 0 for value in positive):  # NaN is not
             raise ConfigError(
-                "GazeConfig: heights must not be empty, and ahead, near and nod must be positive, got "
-                f"heights {self.heights}, ahead {self.ahead:g} m, near {self.near:g} m and nod {self.nod:g} s."
+                "GazeConfig: looks must not be empty, and their distances, near and nod must be positive, got "
+                f"looks {self.looks}, near {self.near:g} m and nod {self.nod:g} s."
             )
 
 
@@ -58,23 +61,31 @@ class Gaze:
 
     def __init__(self, robot: MobileRobot, config: GazeConfig) -> None:
         self.robot, self.config = robot, config
+        self.bystanders: Float[ndarray, "n 2"] = np.empty((0, 2))
+        """Places [m] to look at in turn between the other looks."""
 
     def along(self, path: Float[ndarray, "n 2"], state: Float[ndarray, "3"]) -> None:
         """Look at where a path [m] will lead from a base at `state` (x, y [m], yaw [rad]); ahead where it ends."""
         nearest = int(np.linalg.norm(path - state[:2], axis=1).argmin())
         way = np.r_[0.0, np.linalg.norm(np.diff(path[nearest:], axis=0), axis=1).cumsum()]
         if way[-1] < AT_THE_END:
-            self.towards(state[:2], float(state[2]))
+            self.towards(state, float(state[2]))
             return
-        place = path[nearest + int(np.searchsorted(way, self.config.ahead).clip(0, len(way) - 1))]
-        self.robot.look_at(np.array([*place, self._nod(self.config.heights)]))
+        last = len(way) - 1
+        looks = [
+            (*path[nearest + min(int(np.searchsorted(way, distance)), last)], height)
+            for distance, height in self.config.looks
+        ]
+        self._nod(looks, state)
 
-    def towards(self, position: Float[ndarray, "2"], heading: float) -> None:
-        """Look from a position [m] in a direction [rad], at the floor near by, too."""
-        far = [(self.config.ahead, height) for height in self.config.heights]
-        distance, height = self._nod([(self.config.near, 0.0), *far])
-        place = position + distance * np.array([math.cos(heading), math.sin(heading)])
-        self.robot.look_at(np.array([*place, height]))
+    def towards(self, state: Float[ndarray, "3"], heading: float) -> None:
+        """Look from a base at `state` (x, y [m], yaw [rad]) in a direction [rad], at the floor near by, too."""
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        looks = [
+            (*(state[:2] + distance * ahead), height)
+            for distance, height in ((self.config.near, 0.0), *self.config.looks)
+        ]
+        self._nod(looks, state)
 
     def onward(
         self, way: Float[ndarray, "n 2"], state: Float[ndarray, "3"], rate: float
@@ -91,14 +102,21 @@ class Gaze:
         """
         far = way[np.linalg.norm(way - state[:2], axis=1) > self.config.near]
         if len(far) == 0:
-            self.towards(state[:2], float(state[2]))
+            self.towards(state, float(state[2]))
             return rate, True
         away = far[0] - state[:2]
         heading = math.atan2(away[1], away[0])
         error = math.remainder(heading - state[2], 2 * math.pi)
-        self.towards(state[:2], heading)
+        self.towards(state, heading)
         return float(np.clip(error, -rate, rate)), abs(error) <= FACING
 
-    def _nod(self, between: Sequence[T]) -> T:
-        """One of the things to look at in turn."""
-        return between[int(self.robot.time / self.config.nod) % len(between)]
+    def _nod(self, looks: Sequence[tuple[float, ...]], state: Float[ndarray, "3"]) -> None:
+        """Look at one of the points [m] in turn, and after them at one of the bystanders, another one each time."""
+        others = [place for place in self.bystanders if self._in_reach(place, state)]
+        turn, step = divmod(int(self.robot.time / self.config.nod), len(looks) + bool(others))
+        point = looks[step] if step < len(looks) else (*others[turn % len(others)], CHEST)
+        self.robot.look_at(np.array(point, dtype=float))
+
+    def _in_reach(self, place: Float[ndarray, "2"], state: Float[ndarray, "3"]) -> bool:
+        away = place - state[:2]
+        return abs(math.remainder(math.atan2(away[1], away[0]) - float(state[2]), 2 * math.pi)) < NECK

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from planning.base_planner import BasePlanner, BasePlannerConfig
+from planning.bystanders import bystanders
 from planning.clock import Clock, FootprintMap, MeasuredClock, OnlineMap
 from planning.collision_monitor import CollisionMonitor, Spheres
 from planning.drive import DriveReport, DriveStatus, MobileRobot
@@ -191,7 +192,7 @@ class ReplanningLoop:
         while rate * (self.robot.time - started) < self.config.scan:
             spent = self._sense_and_map()
             state = self.robot.base_state()
-            self.gaze.towards(state[:2], state[2])
+            self.gaze.towards(state, float(state[2]))
             self._pass_time(spent, lambda _: (0.0, rate))
             if self.watch:
                 self.watch(self)
@@ -241,6 +242,7 @@ class ReplanningLoop:
         In a pause there is only one if what came into the way has gone.
         """
         self.field = self.snapshot()
+        self.gaze.bystanders = bystanders(self.field, self.robot.base_state()[:2])
         start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
         end = torch.as_tensor(goal, dtype=torch.float32)
         route = self.planner.route(start, end, self.field, self.robot.time) if pausing else None

@@ -208,11 +208,11 @@ def test_the_camera_nods() -> None:
     robot = Unicycle()
     drive(robot, FREE)
     heights = np.array(robot.looked_at)[:, 2]
-    assert set(heights.tolist()) == set(QUICK.gaze.heights)
+    assert set(heights.tolist()) == {height for _, height in QUICK.gaze.looks}
     assert np.flatnonzero(np.diff(heights)).size > 4
 
 
-@pytest.mark.parametrize("values", [{"nod": 0.0}, {"heights": ()}, {"ahead": -1.0}, {"near": 0.0}])
+@pytest.mark.parametrize("values", [{"nod": 0.0}, {"looks": ()}, {"looks": ((-1.0, 0.0),)}, {"near": 0.0}])
 def test_bad_ways_of_looking_are_refused(values: dict) -> None:
     with pytest.raises(Exception, match=next(iter(values))):
         GazeConfig(**values)

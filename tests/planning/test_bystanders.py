@@ -1,0 +1,76 @@
+"""Where the camera looks between its other looks: at those who came lately and stand about."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from planning.bystanders import REACH, bystanders
+from planning.gaze import Gaze, GazeConfig
+from planning.protocols import ChangingField
+from tests.planning.fields import AutogradField, Cylinder, Union
+from tests.planning.test_replanning import FREE, drive
+from tests.planning.unicycles import Unicycle
+
+HERE = np.array([0.3, -0.2])
+VIEW = math.radians(29)
+
+
+@dataclass
+class Crowd(AutogradField):
+    """People of 20 cm radius who came lately, and a pillar that did not."""
+
+    people: list[tuple[float, float]]
+    pillar: tuple[float, float] = (0.3, 0.6)
+
+    def distance(self, points: Tensor) -> Tensor:
+        return Union(FREE, Cylinder(self.pillar, 0.2), *(Cylinder(p, 0.2) for p in self.people)).distance(
+            points
+        )
+
+    def came(self, points: Tensor) -> Tensor:
+        if not self.people:
+            return torch.zeros(points.shape[:-1], dtype=torch.bool)
+        return torch.cdist(points[..., :2], torch.tensor(self.people).to(points)).amin(dim=-1) < 0.35
+
+
+def test_those_who_came_are_found_nearest_first_and_once_each() -> None:
+    people = [(1.5, -0.2), (-1.1, -0.2), (4.0, 0.0)]
+    field = Crowd(people)
+    assert isinstance(field, ChangingField)
+    found = bystanders(field, HERE)
+    assert len(found) == 2, "neither the pillar nor who is far off"
+    for place, person in zip(found, people[:2], strict=True):
+        assert np.linalg.norm(place - person) < 0.31
+        off = math.atan2(*(place - HERE)[::-1]) - math.atan2(*(np.array(person) - HERE)[::-1])
+        assert abs(math.remainder(off, 2 * math.pi)) < VIEW
+    assert np.linalg.norm(found - HERE, axis=1).max() < REACH
+
+
+def test_without_people_and_without_a_field_that_knows_there_are_none() -> None:
+    assert bystanders(Crowd([]), HERE).shape == bystanders(FREE, HERE).shape == (0, 2)
+
+
+def test_the_camera_looks_at_each_of_them_in_turn_and_along_the_path() -> None:
+    robot, path = Unicycle(), np.array([[0.0, 0.0], [3.0, 0.0]])
+    gaze = Gaze(robot, GazeConfig())
+    gaze.bystanders = np.array([[0.5, 1.0], [0.5, -1.0], [-1.0, 0.1]])
+    for _ in range(80):
+        gaze.along(path, robot.state)
+        robot.time += 0.1
+    looks = [tuple(look[:2].round(6)) for look in robot.looked_at]
+    assert {(0.5, 1.0), (0.5, -1.0)} < set(looks), "both who are beside"
+    assert (-1.0, 0.1) not in looks, "not who is behind: the neck does not turn so far"
+    assert sum(y == 0.0 for _, y in looks) > len(looks) / 2, "mostly where it drives"
+
+
+def test_a_drive_keeps_an_eye_on_who_stands_beside_the_way() -> None:
+    robot = Unicycle()
+    _, report = drive(robot, Crowd([(1.0, -1.2)], (9.0, 9.0)))
+    assert report.success
+    glances = [look for look in robot.looked_at if np.linalg.norm(look[:2] - (1.0, -1.2)) < 0.35]
+    assert 0.05 < len(glances) / len(robot.looked_at) < 0.4
