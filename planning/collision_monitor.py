@@ -1,7 +1,7 @@
-"""The last guard before the motors: it stops the base when the newest depth image shows that contact is imminent.
+"""The last guard before the motors: it stops the base when the last depth images show that contact is imminent.
 
 It knows neither map nor planner, so that no mistake of theirs can mislead it; navigation stacks keep such a monitor
-apart for the same reason.
+apart for the same reason. What the camera has turned away from it remembers for a while.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from planning.errors import ConfigError
+from planning.recent_points import RecentPoints
 
 logger = logging.getLogger(__name__)
 
@@ -44,15 +45,20 @@ class DepthImage(Protocol):
         """The measured points [m, world frame]."""
         ...
 
+    def sees(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+        """Which places [m] it shows: nothing was measured nearer in their direction."""
+        ...
+
 
 @dataclass(frozen=True)
 class CollisionMonitorConfig:
     """When the monitor steps in.
 
     Args:
-        margin: gap [m] to every measured point that the braking robot must keep.
+        margin: gap [m] that the braking robot must keep to every point of the newest image.
         reaction: time [s] until the brakes answer, during which the base goes on as commanded.
         braking: deceleration [m/s^2] of the base; turning brakes three times as fast, in rad/s^2.
+        memory: points that are out of view since count for this long [s].
         max_age: older images [s] tell nothing about the way ahead: the base stops until there is a new one.
         least_points: an image with fewer measured points is taken for no image.
         agreeing: measured points that must agree before they count as an obstacle; lone ones are noise.
@@ -63,6 +69,7 @@ class CollisionMonitorConfig:
     margin: float = 0.02
     reaction: float = 0.2
     braking: float = 0.6
+    memory: float = 2.0
     max_age: float = 0.6
     least_points: int = 100
     agreeing: int = 4
@@ -72,11 +79,13 @@ class CollisionMonitorConfig:
     def __post_init__(self) -> None:
         positive = (self.braking, self.max_age, self.reach)
         if not (
-            min(positive) > 0 and min(self.margin, self.reaction, self.floor) >= 0 and self.agreeing >= 1
+            min(positive) > 0
+            and min(self.margin, self.reaction, self.memory, self.floor) >= 0
+            and self.agreeing >= 1
         ):
             raise ConfigError(
-                "CollisionMonitorConfig: braking, max_age and reach must be positive, margin, reaction and floor not "
-                f"negative and agreeing at least 1, got {self}."
+                "CollisionMonitorConfig: braking, max_age and reach must be positive, margin, reaction, memory and "
+                f"floor not negative and agreeing at least 1, got {self}."
             )
 
 
@@ -90,11 +99,20 @@ class Interventions:
     reason: str = ""
 
 
+class _Obstacle(NamedTuple):
+    """Measured points, how many of them must agree, and how much nearer [m] than `margin` they may be."""
+
+    tree: cKDTree
+    agreeing: int
+    allowance: float
+
+
 class CollisionMonitor:
     """Lets a command of the base pass, slows it or stops it.
 
     A command passes if the robot, held to it for the reaction time and then braking along the same arc, stays clear
-    of every point of the newest image. Where it is too near already, it may move as long as it does not come nearer.
+    of every point of the newest image, and of what the last ones showed where it does not look. Where it is too near
+    already, it may move as long as it does not come nearer.
 
     Args:
         body: the robot's spheres now: centres (s, 3) [m, world] and radii (s,) [m].
@@ -106,6 +124,7 @@ class CollisionMonitor:
         self.interventions = Interventions()
         self._image: DepthImage | None = None
         self._points: Float[ndarray, "n 3"] = np.empty((0, 3))
+        self._recent = RecentPoints(self.config.memory, self.config.agreeing)
         self._state = "clear"
 
     @property
@@ -122,6 +141,7 @@ class CollisionMonitor:
         if len(points) < self.config.least_points:
             return
         self._image, self._points = image, points[points[:, 2] > self.config.floor]
+        self._recent.add(image, self._points)
 
     def limit(self, state: Float[ndarray, " 3"], v: float, omega: float, now: float) -> tuple[float, float]:
         """The command to send instead of (v [m/s], omega [rad/s]).
@@ -151,19 +171,32 @@ class CollisionMonitor:
 
     def _passable(self, state: Float[ndarray, " 3"], v: float, omega: float) -> float:
         """The greatest of `SHARES` with which the base still stops in time; 0 if none."""
-        near = np.linalg.norm(self._points[:, :2] - state[:2], axis=1) <= self.config.reach
-        if near.sum() < self.config.agreeing:
+        obstacles = self._obstacles(state)
+        if not obstacles:
             return 1.0
-        tree, (centres, radii) = cKDTree(self._points[near]), self.body()
-        now = float(self._clearance(tree, centres[None], radii)[0])
+        centres, radii = self.body()
+        now = float(self._clearance(obstacles, centres[None], radii)[0])
         # Where it is too near already it may scrape along for a moment, but must end no nearer: else it would creep.
         on_the_way, at_the_end = min(self.config.margin, now - SHAKE), min(self.config.margin, now)
         for share in SHARES:
             poses = self._way_to_standstill(share * v, share * omega)
-            clearance = self._clearance(tree, moved(centres, state, poses), radii)
+            clearance = self._clearance(obstacles, moved(centres, state, poses), radii)
             if (clearance >= on_the_way).all() and clearance[-1] >= at_the_end:
                 return share
         return 0.0
+
+    def _obstacles(self, state: Float[ndarray, " 3"]) -> list[_Obstacle]:
+        """Points within reach of the base."""
+        config, out = self.config, []
+        for points, agreeing, margin in (
+            (self._points, config.agreeing, config.margin),
+            # Narrow places are driven through with things close on both sides: what is out of view gets no margin.
+            (self._recent.points, 1, 0.0),
+        ):
+            near = points[np.linalg.norm(points[:, :2] - state[:2], axis=1) <= config.reach]
+            if len(near) >= agreeing:
+                out.append(_Obstacle(cKDTree(near), agreeing, config.margin - margin))
+        return out
 
     def _way_to_standstill(self, v: float, omega: float) -> Float[ndarray, "k 3"]:
         """Places relative to the base now, (x, y, yaw), that it passes while it reacts and brakes."""
@@ -179,13 +212,15 @@ class CollisionMonitor:
         return np.stack([v / omega * np.sin(yaw), v / omega * (1 - np.cos(yaw)), yaw], axis=1)
 
     def _clearance(
-        self, tree: cKDTree, centres: Float[ndarray, "k s 3"], radii: Float[ndarray, " s"]
+        self, obstacles: list[_Obstacle], centres: Float[ndarray, "k s 3"], radii: Float[ndarray, " s"]
     ) -> Float[ndarray, " k"]:
         """Least gap [m] to as many points as must agree, of every place."""
-        agreeing = self.config.agreeing
         bound = float(radii.max()) + self.config.margin + 0.3
-        distance, _ = tree.query(centres, k=[agreeing], distance_upper_bound=bound)
-        return np.minimum(distance[..., 0] - radii, bound).min(axis=1)
+        least = np.full(len(centres), bound)
+        for tree, agreeing, allowance in obstacles:
+            distance, _ = tree.query(centres, k=[agreeing], distance_upper_bound=bound)
+            least = np.minimum(least, (distance[..., 0] - radii).min(axis=1) + allowance)
+        return least
 
     def _note(self, state: str, reason: str) -> None:
         if state != self._state and state != "clear":

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from robots.errors import RobotError
 from robots.simulation.poses import inverse_pose, link_frames
@@ -69,6 +69,23 @@ class DepthFrame:
         valid = self.depth > 0
         local = self.camera.rays()[valid] * self.depth[valid][:, None]
         return local @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
+
+    def sees(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Which places [m, world] it shows: in their direction, and in the pixels beside, nothing nearer was measured.
+
+        What is as far as the measured surface is seen, too: within 3 cm, and more farther away as depth cameras go.
+        """
+        x, y, z = self.T_world_camera[:3, :3].T @ (points - self.T_world_camera[:3, 3]).T
+        ahead, camera = np.maximum(z, 1e-3), self.camera
+        u = np.round(x / ahead * camera.fx + camera.cx).clip(-9, camera.width + 9).astype(int)
+        v = np.round(y / ahead * camera.fy + camera.cy).clip(-9, camera.height + 9).astype(int)
+        inside = (z > 0) & (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)
+        beside = np.arange(-1, 2)
+        near = self.depth[v[inside, None, None] + beside[:, None], u[inside, None, None] + beside].min(
+            axis=(1, 2)
+        )
+        inside[inside] = z[inside] <= near + 0.03 + 0.012 * near**2
+        return inside
 
 
 class DepthCamera:

@@ -1,4 +1,4 @@
-"""The collision monitor: brakes in time for what the newest image shows, and for nothing else."""
+"""The collision monitor: brakes in time for what the last images show, and for nothing else."""
 
 from __future__ import annotations
 
@@ -22,9 +22,13 @@ class Image:
 
     cloud: np.ndarray
     time: float = 0.0
+    sees_all: bool = True
 
     def points(self) -> np.ndarray:
         return self.cloud
+
+    def sees(self, points: np.ndarray) -> np.ndarray:
+        return np.full(len(points), self.sees_all)
 
 
 @dataclass
@@ -127,6 +131,39 @@ def test_without_a_new_image_it_stops_and_goes_on_with_one(image: Image | None) 
     assert monitor.interventions.blind == 1 and "no depth image" in monitor.interventions.reason
     monitor.see(Image(floor(), 5.0))
     assert monitor.limit(AT_ORIGIN, 0.4, 0.0, 5.1) == (0.4, 0.0)
+
+
+def looked_away(*clouds: np.ndarray, seen: float = 0.0, robot: Robot | None = None) -> CollisionMonitor:
+    """It saw these, and a moment later the camera shows nothing but the floor elsewhere."""
+    monitor = CollisionMonitor((robot or Robot()).body)
+    monitor.see(Image(np.concatenate([floor(), *clouds]), seen))
+    monitor.see(Image(floor(), seen + 0.5, sees_all=False))
+    return monitor
+
+
+def test_what_the_camera_has_turned_away_from_stops_it_for_a_while() -> None:
+    monitor = looked_away(wall(0.46))
+    assert monitor.limit(AT_ORIGIN, 0.3, 0.0, 0.6) == (0.0, 0.0)
+    later = CONFIG.memory + 0.1
+    monitor.see(Image(floor(), later, sees_all=False))
+    assert monitor.limit(AT_ORIGIN, 0.3, 0.0, later) == (0.3, 0.0), "by then it may have gone"
+
+
+def test_what_an_image_shows_to_have_gone_is_forgotten_at_once() -> None:
+    monitor = looked_away(wall(0.46))
+    monitor.see(Image(floor(), 0.6))
+    assert monitor.limit(AT_ORIGIN, 0.3, 0.0, 0.6) == (0.3, 0.0)
+
+
+def test_narrow_places_are_driven_through_with_their_sides_out_of_view() -> None:
+    ahead = wall(0.31)[:, [1, 0, 2]]  # from 1 m behind to 1 m ahead, at y = 0.31
+    sides = ahead[ahead[:, 0] > 0.2], (ahead * (1, -1, 1))[ahead[:, 0] > 0.2]
+    assert watching(*sides).limit(AT_ORIGIN, 0.3, 0.0, 0.1)[0] < 0.3
+    assert looked_away(*sides).limit(AT_ORIGIN, 0.3, 0.0, 0.6) == (0.3, 0.0)
+
+
+def test_lone_points_are_not_remembered() -> None:
+    assert looked_away(np.array([[0.5, 0.0, 0.7]])).limit(AT_ORIGIN, 0.3, 0.0, 0.6) == (0.3, 0.0)
 
 
 def test_the_first_image_is_waited_for() -> None:

@@ -31,6 +31,9 @@ class Image:
     def points(self) -> np.ndarray:
         return self.cloud
 
+    def sees(self, points: np.ndarray) -> np.ndarray:
+        return np.ones(len(points), dtype=bool)
+
 
 def surface(pillar: Cylinder) -> np.ndarray:
     angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, 120), np.arange(0.1, 1.4, 0.05))

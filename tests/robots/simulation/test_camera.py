@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,26 @@ def test_a_wall_ahead_has_one_depth_whatever_the_pixel():
         frame = DepthCamera(world, T_link_camera=_looking([0.0, 0.3, 0.2])).render()
     assert frame.depth.shape == (120, 160) and frame.depth.dtype == np.float32
     assert np.allclose(frame.depth, 2.0, atol=1e-5), "z-depth, not length of the ray"
+
+
+def test_a_frame_tells_which_places_it_shows():
+    pillar = Box("pillar", planar_pose(1.0, 0.0, 0.0), (0.2, 0.2, 4.0))
+    wall = Box("wall", planar_pose(2.1, 0, 0), (0.2, 20.0, 20.0))
+    with World(Scene("yard", static=(pillar, wall))) as world:
+        frame = DepthCamera(world, T_link_camera=_looking([0.0, 0.0, 0.5])).render()
+    surface, before, beside = [0.9, 0.0, 0.5], [0.6, 0.0, 0.5], [1.2, 0.3, 0.5]
+    assert frame.sees(np.array([surface, before, beside])).all()
+    behind, in_the_wall, at_the_back, outside = (
+        [1.5, 0.0, 0.5],
+        [2.2, 0.5, 0.5],
+        [-0.9, 0.0, 0.5],
+        [0.9, 1.0, 0.5],
+    )
+    edge = [1.1, 0.1 / 0.9 * 1.1 + 0.005, 0.5]  # less than a pixel beside the pillar's edge
+    assert not frame.sees(np.array([behind, in_the_wall, at_the_back, outside, edge])).any()
+    assert frame.sees(np.empty((0, 3))).shape == (0,)
+    blind = replace(frame, depth=np.zeros_like(frame.depth))
+    assert not blind.sees(np.array([surface, before])).any()
 
 
 def test_a_floor_below_obeys_the_pinhole_equation(yard):
