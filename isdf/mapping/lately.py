@@ -8,12 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
 
-# What is this near [m] to where something was seen belongs to it.
-REACH = 0.1
-
 
 class Lately(NamedTuple):
-    """Cubes of space in which something was seen that has come.
+    """Cubes of space in which surfaces have come nearer, and those beside them.
 
     Args:
         cubes: which.
@@ -27,16 +24,18 @@ class Lately(NamedTuple):
 
     @classmethod
     def of(cls, places: Int[np.ndarray, "n 3"], edge: float) -> Lately:
-        """The cubes of these indices."""
+        """The cubes of these indices, and their neighbours: what the field interpolates may lie a little beside."""
         if len(places) == 0:
             return cls(np.zeros((0, 0, 0), dtype=bool), np.zeros(3, dtype=np.int64), edge)
-        corner = places.min(axis=0)
-        cubes = np.zeros(places.max(axis=0) + 1 - corner, dtype=bool)
+        corner = places.min(axis=0) - 1
+        cubes = np.zeros(places.max(axis=0) + 2 - corner, dtype=bool)
         cubes[tuple((places - corner).T)] = True
+        for axis in range(3):  # no marked cube lies at the rim
+            cubes |= np.roll(cubes, 1, axis) | np.roll(cubes, -1, axis)
         return cls(cubes, corner, edge)
 
     def near(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points [m] lie in them or no more than `REACH` beside."""
+        """Which points [m] lie in them."""
         out = np.zeros(len(points), dtype=np.bool_)
         if self.cubes.size:
             _look_up(points, self.cubes, self.corner, self.edge, out)
@@ -46,16 +45,12 @@ class Lately(NamedTuple):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _look_up(points, cubes, corner, edge, out):
-    """Set `out` (n,) where a box of twice `REACH` about points (n, 3) [m] overlaps marked cubes."""
-    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    """Set `out` (n,) where points (n, 3) [m] lie in marked cubes."""
     for n in range(points.shape[0]):
-        for axis in range(3):
-            place = points[n, axis]
-            if not np.isfinite(place):
-                place = -np.float64(1e9)
-            first[axis] = max(int(np.floor((place - REACH) / edge)) - corner[axis], 0)
-            last[axis] = min(int(np.floor((place + REACH) / edge)) - corner[axis], cubes.shape[axis] - 1)
-        for i in range(first[0], last[0] + 1):
-            for j in range(first[1], last[1] + 1):
-                for k in range(first[2], last[2] + 1):
-                    out[n] |= cubes[i, j, k]
+        x, y, z = (
+            points[n, 0] / edge - corner[0],
+            points[n, 1] / edge - corner[1],
+            points[n, 2] / edge - corner[2],
+        )
+        if 0 <= x < cubes.shape[0] and 0 <= y < cubes.shape[1] and 0 <= z < cubes.shape[2]:
+            out[n] = cubes[int(x), int(y), int(z)]

@@ -179,8 +179,16 @@ class Visitors:
 
     def lately(self) -> Lately:
         """Where something came and, as far as the camera knows, still is."""
-        seen = self._kept.place[np.isfinite(self._kept.first)]
-        return Lately.of(np.concatenate([seen, self._settled.place]), self._edge)
+        kept = self._kept.of(np.isfinite(self._kept.first)).and_also(self._settled)
+        row = self.bricks.table[tuple((kept.place - self.bricks.corner).T)]
+        kept, row = kept.of(row >= 0), row[row >= 0]
+        there = self.bricks.weight[row] > 0
+        there &= _nearer(self.bricks.distance[row], kept.distance, kept.weight, self.bricks.voxel)
+        # Two voxels a side are one cube.
+        cubes = there.reshape(-1, *(SIDE // 2, 2) * 3).any(axis=(2, 4, 6))
+        brick, *inside = np.nonzero(cubes)
+        places = kept.place[brick] * (SIDE // 2) + np.stack(inside, axis=1)
+        return Lately.of(places, 2 * self.bricks.voxel)
 
     @property
     def _edge(self) -> float:
@@ -231,7 +239,7 @@ class Visitors:
         there = row >= 0
         row, before, weight = row[there], back.distance[there], back.weight[there]
         now = self.bricks.distance[row]
-        nearer = np.where(weight > 0, now < before - 0.5 * self.bricks.voxel, now < BEFORE)
+        nearer = _nearer(now, before, weight, self.bricks.voxel)
         self.bricks.distance[row] = np.where(nearer, before, now)
         self.bricks.weight[row] = np.where(nearer, weight, self.bricks.weight[row])
         self.bricks.ended[row] = np.where(nearer, back.ended[there], self.bricks.ended[row])
@@ -239,6 +247,16 @@ class Visitors:
         seen[nodes] = np.maximum(seen[nodes], back.evidence)
         begin = begin - self.lattice.corner
         self.lattice.write(begin, begin + seen.shape, evidence=seen)
+
+
+def _nearer(
+    now: Float[np.ndarray, "n 512"],
+    before: Float[np.ndarray, "n 512"],
+    weight: Float[np.ndarray, "n 512"],
+    voxel: float,
+) -> Bool[np.ndarray, "n 512"]:
+    """Where distances [m] are less than before, by half a voxel [m]; what had no `weight` was not known to be free."""
+    return np.where(weight > 0, now < before - 0.5 * voxel, now < BEFORE)
 
 
 @njit(cache=True, nogil=True)

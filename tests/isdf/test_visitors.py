@@ -77,6 +77,19 @@ def test_who_walks_out_of_view_is_taken_back():
     assert not during.came(points + torch.tensor([0.0, 1.5, 0.0])).any()
 
 
+def test_furniture_beside_somebody_who_came_has_not_come():
+    before, during, _ = mapped(2.0)
+    points = (torch.rand(60_000, 3, generator=torch.Generator().manual_seed(2)) - 0.5) * torch.tensor(
+        [2.4, 2.4, 1.2]
+    )
+    points = points + torch.tensor([*LAST, 0.7])
+    person_there, room = person(*LAST)(points), furnished_room()(points)
+    surface = before.distance(points).abs() < 0.02
+    beside = surface & (room.abs() < 0.03) & (person_there > 0.15) & (person_there < 0.8)
+    assert beside.sum() > 50
+    assert during.came(points[beside]).float().mean() < 0.1
+
+
 def test_a_map_that_never_forgets_keeps_it():
     _, during, after = mapped(None)
     points = around(*LAST)
@@ -120,7 +133,8 @@ def test_what_is_seen_to_stay_is_kept():
     watch(mapper, ASIDE, 4.0, LAST)
     points = around(*LAST)
     assert (mapper.field().distance(points) - during.distance(points)).abs().mean() < 0.02
-    assert mapper.field().came(points).float().mean() > 0.8
+    surface = points[during.distance(points).abs() < 0.05]
+    assert mapper.field().came(surface).float().mean() > 0.9
     watch(mapper, ASIDE, 9.0, LAST)
     mapper.refresh()
     assert (mapper.field().distance(points) - during.distance(points)).abs().mean() < 0.02
@@ -163,11 +177,18 @@ def test_only_bricks_that_something_came_into_are_given_back(first):
 
 
 def test_what_belongs_to_something_that_came_may_lie_a_little_beside_its_bricks():
-    lately = Lately.of(np.array([[1, 0, -2], [5, 0, -2]]), 0.32)  # the first from x = 0.32 to 0.64
-    x = np.array([0.2, 0.23, 0.4, 0.73, 0.75, 1.65, np.nan])
-    points = np.stack([x, np.full(7, 0.1), np.full(7, -0.5)], axis=1)
+    lately = Lately.of(np.array([[1, 0, -2], [5, 0, -2]]), 0.08)  # the first from x = 0.08 to 0.16
+    x = np.array([-0.01, 0.01, 0.12, 0.23, 0.25, 0.42, np.nan])
+    points = np.stack([x, np.full(7, 0.05), np.full(7, -0.1)], axis=1)
     assert lately.near(points).tolist() == [False, True, True, True, False, True, False]
-    assert not Lately.of(np.empty((0, 3), dtype=np.int64), 0.32).near(points).any()
+    assert lately.near(points + np.array([0.0, 0.1, 0.05])).tolist() == lately.near(points).tolist(), (
+        "at the corners, too"
+    )
+    assert (
+        not lately.near(points + np.array([0.0, 0.2, 0.0])).any()
+        and not lately.near(points - np.array([0.0, 0.0, 0.2])).any()
+    )
+    assert not Lately.of(np.empty((0, 3), dtype=np.int64), 0.08).near(points).any()
 
 
 def test_who_was_close_has_gone_when_the_camera_looks_past_him():
