@@ -20,6 +20,8 @@ TOLERANCE, NOISE = 0.03, 0.012
 EDGE = 0.05
 # A pose closer than this to where the motion leads [m, rad] needs no test.
 NEAR, TURNED = 0.06, 0.05
+# A camera on a neck sits so far [m] beside the axes that it turns about: it moves by so much times the angle.
+LEVER = 0.12
 # The share of points in disagreement must exceed that at the other pose by this much, and by this factor.
 WORSE, TIMES = 0.05, 2.0
 # Least share of the image that both views must show, and least number of points.
@@ -47,7 +49,8 @@ class Verdict(NamedTuple):
 
     Args:
         away: how far [m] from its pose the image fits clearly better; None where its pose is as good as any.
-        confirmed: whether the pose is where the motion leads, or the image fits clearly better at it than there.
+        confirmed: whether the camera is where the motion leads, whichever way it has turned, or the image fits clearly
+            better at its pose than there.
     """
 
     away: float | None
@@ -70,15 +73,16 @@ class Motion:
         if self._last is None:
             return Verdict(None, False)
         expected = self._expected(moment.time)
-        if _close(expected, moment.pose):
+        moved, turned = _apart(expected, moment.pose)
+        if moved < NEAR and turned < TURNED:
             return Verdict(None, True)
+        steady = moved < NEAR + LEVER * turned
         claimed = self._disagreement(moment, moment.pose, stride)
         other = self._disagreement(moment, expected, stride)
         if claimed is None or other is None:
-            return Verdict(None, False)
+            return Verdict(None, steady)
         jumped = claimed >= max(TIMES * other, other + WORSE)
-        away = float(np.linalg.norm(expected[:3, 3] - moment.pose[:3, 3])) if jumped else None
-        return Verdict(away, claimed <= other - WORSE)
+        return Verdict(moved if jumped else None, steady or claimed <= other - WORSE)
 
     def _expected(self, when: float) -> Float[np.ndarray, "4 4"]:
         """The pose that the motion between the last two frames leads to."""
@@ -109,9 +113,10 @@ class Motion:
         return wrong / shared if shared >= max(POINTS, OVERLAP * valid) else None
 
 
-def _close(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
+def _apart(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
+    """Distance [m] and angle [rad] between two poses."""
     cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
-    return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < NEAR and np.arccos(np.clip(cosine, -1, 1)) < TURNED)
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(np.arccos(np.clip(cosine, -1, 1)))
 
 
 @njit(cache=True, nogil=True)

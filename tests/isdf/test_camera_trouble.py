@@ -120,6 +120,22 @@ def test_somebody_who_steps_before_the_camera_is_no_jump_even_while_it_nods(fram
     assert mapper.frames_skipped == 0
 
 
+def test_somebody_before_a_camera_that_glances_about_is_no_jump(frames):
+    mapper = Mapper()
+    for frame in frames[:10]:
+        mapper.integrate(frame)
+    eye = (-0.8, -1.3, 1.2)
+    for n in range(12):  # every other image shows nothing of what the last one showed
+        x, y = -0.45 + 0.03 * (11 - n), -0.95 - 0.04 * (11 - n)
+        room = union(furnished_room(), box((x, y, 0.7), (0.4, 0.4, 1.4)))
+        angle = math.atan2(0.6, 0.7) + 1.3 * (n % 2)
+        # The camera sits beside the axis that it turns about.
+        at = np.array([math.cos(angle), math.sin(angle)])
+        pose = look_at((*(eye[:2] + 0.1 * at), eye[2]), (*(eye[:2] + at), 0.5))
+        mapper.integrate(render(room, pose, CAMERA, 1.0 + n / FPS))
+    assert mapper.frames_skipped == 0
+
+
 def test_lost_and_black_frames_and_an_image_that_hangs_do_little_harm(frames, points, untroubled, caplog):
     rng, mapper, refused = np.random.default_rng(1), Mapper(), 0
     lost = set(rng.choice(np.arange(1, 28), 3, replace=False).tolist())
