@@ -35,10 +35,11 @@ class BasePlannerConfig:
         clearance_change: a plan is no longer good when the map has taken this much [m] of its clearance.
         off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
         looks: how often the robot stands before blocked space and looks, before it counts as blocked.
+        looks_came: the same where something came, which may go again: other ways lead through space that is blocked or
+            unknown as well, and whoever sets off for one after a moment is seldom there earlier.
         memory: blocked space is given another chance after this long [s], for the world changes.
-        memory_came: the same [s] for space that was free before: what came there may go again.
-        stand_off: distance [m] to keep from what came into the way, to see all of it down to the floor, and to let it
-            pass; and from other blocked space when it looks at it for the last time.
+        stand_off: the base comes no nearer [m] to what came into the way, to see all of it down to the floor and to let
+            it pass; and backs off so far from other blocked space when it looks at it for the last time.
         wary: clearance [m] that is kept, on top of all others, from what came lately: it may move on, and its far side
             was not seen.
         room: unknown space this near [m] to the axis of the base, where it was put down, counts as free: a camera on
@@ -61,26 +62,26 @@ class BasePlannerConfig:
     clearance_change: float = 0.05
     off_path: float = 0.25
     looks: int = 3
+    looks_came: int = 8
     memory: float = 30.0
-    memory_came: float = 10.0
     stand_off: float = 1.0
     wary: float = 0.03
     room: float = 0.5
 
     def __post_init__(self) -> None:
-        positive = (self.clearance_change, self.off_path, self.memory, self.memory_came, self.room)
+        positive = (self.clearance_change, self.off_path, self.memory, self.room)
         good = (
             all(value > 0 for value in positive)  # NaN is not
             and self.stand_off >= 0
             and self.wary >= 0
             and self.num_waypoints >= 3
-            and self.looks >= 1
+            and min(self.looks, self.looks_came) >= 1
             and self.margin >= self.search.least_margin
         )
         if not good:
             raise ConfigError(
-                "BasePlannerConfig: clearance_change, off_path, memory, memory_came and room must be positive, "
-                "stand_off and wary not negative, num_waypoints at least 3, looks at least 1 and margin at least "
+                "BasePlannerConfig: clearance_change, off_path, memory and room must be positive, stand_off and "
+                "wary not negative, num_waypoints at least 3, looks and looks_came at least 1 and margin at least "
                 f"search.least_margin, got {self}."
             )
 
@@ -117,9 +118,11 @@ class BasePlan:
         return f"{self.result.status.value}: {self.result.message}"
 
 
-# Something has come only where so many positions, into what is blocked now, were free: the edges of walls shift with
-# every image.
+# Something has come where so many positions, into what is blocked now, were free: the edges of walls shift with every
+# image.
 DEEP = 4
+# A way leads on if it is free for so much more [m] than the distance to stand off.
+FREE = 0.5
 
 
 class _Look(NamedTuple):
@@ -186,13 +189,14 @@ class BasePlanner:
             now: time [s], to know how old a dead end is.
         """
         self.stood(start)
-        self._looks = [look for look in self._looks if now - look.when < self._memory(look)]
+        self._looks = [look for look in self._looks if now - look.when < self.config.memory]
         route = route or self.route(start, goal, sdf, now)
         self._once_free.add(route.grid.free)
-        came = route.entry is not None and bool(self._once_free.were(route.onward[:DEEP]).all())
+        explored = self._explored(sdf)
+        came = self._has_come(route, explored)
         if route.entry is not None:
             route = self._to_look_from(route, came)
-        result = self._optimised(route, self._explored(sdf))
+        result = self._optimised(route, explored)
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
             self._looks.append(_Look(now, route.entry, came))
@@ -203,6 +207,12 @@ class BasePlanner:
     ) -> Route:
         """The way to the goal, past what stayed blocked when it was looked at."""
         return grid_search(self.body, self._explored(sdf), start, goal, self.config.search, self._closed(now))
+
+    def leads_on(self, route: Route) -> bool:
+        """Whether a way that was blocked by what came is free by now, all of it or the next part."""
+        if route.entry is None:
+            return route.reaches_goal
+        return float((route.entry - route.path[0]).norm()) > self.config.stand_off + FREE
 
     def still_good(self, plan: PlanResult, position: Float[Tensor, "2"], sdf: DistanceField) -> bool:
         """Whether what is left of a plan from where the base stands [m] keeps its clearance on a new map."""
@@ -260,33 +270,44 @@ class BasePlanner:
         """The part of a route that leads to where the space that blocks it is best looked at.
 
         From close by, since most of what is unknown shows itself on the way there; but the last time from `stand_off`,
-        for close to the robot its camera sees nothing. From what came into the way it stands off anyhow, but backs off
-        only for the last time: what came may walk on at once, and who backs off has to turn away and back again.
+        for close to the robot its camera sees nothing. From what came into the way it stands off from the first, but
+        never backs off: what came may walk on at once, and who backs off has to turn away and back again.
         """
         assert route.entry is not None
         entry, off = route.entry, self.config.stand_off
-        looks = sum(bool((look.place - entry).norm() < off) for look in self._looks)
         near = (route.path - entry).norm(dim=1) < off
-        last = looks >= self.config.looks - 1
-        if came and near[0] and not last:
-            return replace(route, path=route.path[:1])
-        if not came and not last:
-            return route
-        if near[0]:
-            return replace(route, path=route.grid.way_back(route.path[0], entry, off))
-        return replace(route, path=route.path[: int(near.float().argmax())] if near.any() else route.path)
+        if not came:
+            looks = sum(bool((look.place - entry).norm() < off) for look in self._looks)
+            if looks < self.config.looks - 1:
+                return route
+            if near[0]:
+                return replace(route, path=route.grid.way_back(route.path[0], entry, off))
+        end = max(1, int(near.float().argmax())) if near.any() else len(route.path)
+        return replace(route, path=route.path[:end])
 
-    def _memory(self, look: _Look) -> float:
-        return self.config.memory_came if look.came else self.config.memory
+    def _has_come(self, route: Route, sdf: DistanceField) -> bool:
+        """Whether what blocks the way has come: space was free there, or the field knows that it came."""
+        if route.entry is None:
+            return not route.reaches_goal and any(look.came for look in self._looks)
+        if bool(self._once_free.were(route.onward[:DEEP]).all()):
+            return True
+        if not isinstance(sdf, ExploredField):
+            return False
+        workspace = Workspace(self.body, sdf, eps=1.0, config=self.config.search.workspace)
+        centres, radii = self.body.spheres(route.entry)
+        clearance = workspace.clearance(centres, radii)
+        solid = clearance < self.config.search.least_margin
+        return bool(solid.any()) and bool(sdf.by_what_came(centres[clearance.argmin()]))
 
     def _closed(self, now: float) -> Float[Tensor, "c 2"] | None:
         """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
-        places = [look.place for look in self._looks if now - look.when < self._memory(look)]
-        if not places:
+        looks = [look for look in self._looks if now - look.when < self.config.memory]
+        if not looks:
             return None
-        entries = torch.stack(places)
+        entries = torch.stack([look.place for look in looks])
         visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
-        return entries[visits >= self.config.looks]
+        enough = [self.config.looks_came if look.came else self.config.looks for look in looks]
+        return entries[visits >= torch.tensor(enough)]
 
 
 def _gap(path: Float[Tensor, "k 2"], position: Float[Tensor, "2"]) -> float:

@@ -78,16 +78,24 @@ class ExploredField:
         _add_trodden(points.detach().cpu().numpy().reshape(-1, 3), self.trodden.low, self.trodden.cells, seen)
         return torch.from_numpy(seen).to(points).view(points.shape[:-1])
 
+    def by_what_came(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """At which points [m] the nearest thing is one that came lately. The floor, on which it stands, has not."""
+        if not isinstance(self.field, ChangingField):
+            return torch.zeros(points.shape[:-1], dtype=torch.bool)
+        return self._came(points, *self.field.distance_and_gradient(points))
+
     @property
     def _is_wary(self) -> bool:
         return self.wary > 0 and isinstance(self.field, ChangingField)
 
     def _nearer(self, points: Tensor, distance: Tensor, gradient: Tensor) -> Float[Tensor, "*batch"]:
         """How much nearer than `distance` something is to points [m]."""
+        return self.wary * self._came(points, distance, gradient)
+
+    def _came(self, points: Tensor, distance: Tensor, gradient: Tensor) -> Bool[Tensor, "*batch"]:
         assert isinstance(self.field, ChangingField)
         came = self.field.came(points.detach() - distance.unsqueeze(-1) * gradient)
-        # The floor, on which everybody stands, has not come.
-        return self.wary * (came & (gradient[..., 2] <= MIN_FLOOR_SLOPE))
+        return came & (gradient[..., 2] <= MIN_FLOOR_SLOPE)
 
     def _observed(self, points: Tensor) -> Bool[Tensor, "*batch"]:
         if isinstance(self.field, ObservingField):

@@ -93,26 +93,26 @@ class Gaze:
         """Look along where a way [m] would go on, if there is one, and else ahead while the base turns.
 
         Args:
-            way: positions; those nearer than `near` do not count.
+            way: positions; of those nearer than `near` only the last counts, if there are no others.
             state: x, y [m], yaw [rad] of the base.
             rate: of turning [rad/s].
 
         Returns:
             How fast to turn [rad/s], and whether the camera looks there already; around it always does.
         """
-        far = way[np.linalg.norm(way - state[:2], axis=1) > self.config.near]
-        if len(far) == 0:
+        if len(way) == 0:
             self.towards(state, float(state[2]))
             return rate, True
-        away = far[0] - state[:2]
+        far = np.linalg.norm(way - state[:2], axis=1) > self.config.near
+        away = way[int(far.argmax()) if far.any() else -1] - state[:2]
         heading = math.atan2(away[1], away[0])
         error = math.remainder(heading - state[2], 2 * math.pi)
         self.towards(state, heading)
         return float(np.clip(error, -rate, rate)), abs(error) <= FACING
 
     def _nod(self, looks: Sequence[tuple[float, ...]], state: Float[ndarray, "3"]) -> None:
-        """Look at one of the points [m] in turn, and after them at one of the bystanders, another one each time."""
-        others = [place for place in self.bystanders if self._in_reach(place, state)]
+        """Look at one of the points [m] in turn, and after them at one of the two nearest bystanders."""
+        others = [place for place in self.bystanders if self._in_reach(place, state)][:2]
         turn, step = divmod(int(self.robot.time / self.config.nod), len(looks) + bool(others))
         point = looks[step] if step < len(looks) else (*others[turn % len(others)], CHEST)
         self.robot.look_at(np.array(point, dtype=float))

@@ -239,14 +239,14 @@ class ReplanningLoop:
     def _decide(self, goal: Float[ndarray, "2"], pausing: bool) -> PlanResult | None:
         """Keep the plan while it is good; else make one, to the goal or as near to it as the map allows.
 
-        In a pause there is only one if what came into the way has gone.
+        In a pause there is only one if what came into the way has gone or walked on.
         """
         self.field = self.snapshot()
         self.gaze.bystanders = bystanders(self.field, self.robot.base_state()[:2])
         start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
         end = torch.as_tensor(goal, dtype=torch.float32)
         route = self.planner.route(start, end, self.field, self.robot.time) if pausing else None
-        if route is not None and not route.reaches_goal:
+        if route is not None and not self.planner.leads_on(route):
             return None
         plan = self.plan or self.giving_way.plan
         if plan is not None:
@@ -262,6 +262,8 @@ class ReplanningLoop:
         fresh = self.planner.plan(start, end, self.field, route, self.robot.time)
         self.report.plans += 1
         self._onward = fresh.onward.numpy().astype(float)
+        if fresh.came and not len(self._onward):
+            self._onward = goal[None]
         if fresh.usable:
             # A plan that the base cannot begin to follow is as good as none.
             gone = float(np.linalg.norm(self.robot.base_state()[:2] - self._failed_at))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,9 +11,10 @@ from torch import Tensor
 
 from planning.bystanders import REACH, bystanders
 from planning.gaze import Gaze, GazeConfig
+from planning.grid_search import GridSearchConfig
 from planning.protocols import ChangingField
 from tests.planning.fields import AutogradField, Cylinder, Union
-from tests.planning.test_replanning import FREE, drive
+from tests.planning.test_replanning import FREE, QUICK, drive
 from tests.planning.unicycles import Unicycle
 
 HERE = np.array([0.3, -0.2])
@@ -74,3 +75,28 @@ def test_a_drive_keeps_an_eye_on_who_stands_beside_the_way() -> None:
     assert report.success
     glances = [look for look in robot.looked_at if np.linalg.norm(look[:2] - (1.0, -1.2)) < 0.35]
     assert 0.05 < len(glances) / len(robot.looked_at) < 0.4
+
+
+def test_what_blocks_the_way_right_before_the_robot_is_faced_and_not_turned_away_from() -> None:
+    robot = Unicycle((0.0, 0.0, 0.2))
+    gaze = Gaze(robot, GazeConfig())
+    close = np.array([[0.3, 0.0], [0.5, 0.0]])
+    turn, faces = gaze.onward(close, robot.state, 0.5)
+    assert turn < 0 and faces and abs(robot.looked_at[-1][1]) < 1e-6
+    beyond = np.array([[0.3, 0.0], [0.0, 2.0]])
+    turn, faces = gaze.onward(beyond, robot.state, 0.5)
+    assert turn == 0.5 and not faces, "to the first that is farther"
+    assert gaze.onward(close[:0], robot.state, 0.5) == (0.5, True), "all around, where there is no way on"
+
+
+def test_while_it_waits_it_looks_at_what_came_even_where_no_way_is_left_to_try() -> None:
+    robot = Unicycle()
+    barrier = Crowd([(1.6, y / 4) for y in range(-24, 25)], (9.0, 9.0))
+    search = GridSearchConfig(padding=1.5, through_blocked=30.0, closed_radius=30.0)
+    config = replace(
+        QUICK, planner=replace(QUICK.planner, search=search, looks_came=1), time_limit=25.0, patience=15
+    )
+    drive(robot, lambda: FREE if robot.time < 3.0 else barrier, config)
+    late = [look for look in robot.looked_at if look[2] < 1.1][-20:]
+    assert abs(math.remainder(robot.state[2], 2 * math.pi)) < 0.5
+    assert all(look[0] > robot.state[0] for look in late)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 import torch
 
 from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.drive import DriveStatus
-from planning.grid_search import grid_search
+from planning.grid_search import GridSearchConfig, grid_search
 from planning.once_free import OnceFree
 from tests.planning.fields import Box
 from tests.planning.test_replanning import BODY, FREE, QUICK, drive
@@ -58,12 +59,48 @@ def test_a_wall_whose_edge_shifts_has_not_come() -> None:
     assert not plan.reaches_goal and not plan.came
 
 
-def test_too_near_to_what_came_it_waits_and_then_backs_off() -> None:
+def test_too_near_to_what_came_it_waits_where_it_is_however_often_it_looks() -> None:
     planner, near = BasePlanner(BODY), torch.tensor([1.4, 0.0])
     planner.plan(near, GOAL, FREE)
-    *waits, last = [planner.plan(near, GOAL, BARRIER, now=now) for now in (1.0, 3.0, 5.0)]
-    assert all(plan.dead_end and plan.came and "came into the way" in plan.reason for plan in waits)
-    assert last.usable and float(last.result.trajectory.waypoints[-1, 0]) < 0.8
+    for now in (1.0, 3.0, 5.0):
+        plan = planner.plan(near, GOAL, BARRIER, now=now)
+        assert plan.dead_end and plan.came and "came into the way" in plan.reason
+
+
+def test_where_nothing_is_left_to_look_at_it_still_knows_that_something_came() -> None:
+    search = GridSearchConfig(through_blocked=30.0, closed_radius=30.0)
+    planner, near = (
+        BasePlanner(BODY, BasePlannerConfig(search=search, looks_came=1)),
+        torch.tensor([1.4, 0.0]),
+    )
+    planner.plan(near, GOAL, FREE)
+    first, second = (planner.plan(near, GOAL, BARRIER, now=now) for now in (1.0, 3.0))
+    assert len(first.onward) and not len(second.onward)
+    assert first.came and second.came and second.dead_end
+
+
+@dataclass
+class Knowing(Box):
+    """A box that knows from which x [m] on it came lately."""
+
+    since: float = 0.0
+
+    def observed(self, points: torch.Tensor) -> torch.Tensor:
+        return torch.ones(points.shape[:-1], dtype=torch.bool)
+
+    def came(self, points: torch.Tensor) -> torch.Tensor:
+        return points[..., 0] > self.since
+
+
+@pytest.mark.parametrize(("since", "came"), [(1.0, True), (3.0, False)])
+def test_what_the_field_knows_to_have_come_is_kept_off_though_nothing_was_free_there(
+    since: float, came: bool
+) -> None:
+    barrier = Knowing((2.0, 0.0, 0.5), (0.3, 30.0, 1.0), since)
+    plan = BasePlanner(BODY).plan(START, GOAL, barrier)
+    assert plan.came == came
+    gap = float((plan.onward[0] - plan.result.trajectory.waypoints[-1]).norm())
+    assert 1.0 <= gap < 1.2 if came else gap < 0.2
 
 
 def test_the_robot_waits_for_what_came_and_goes_on_when_it_is_gone() -> None:
@@ -95,6 +132,19 @@ def test_it_goes_on_as_soon_as_what_came_has_gone() -> None:
     assert robot.time < 33.0
 
 
+def test_it_follows_what_came_and_has_walked_on() -> None:
+    robot = Unicycle()
+    goal, near, far = (6.0, 0.0), *(Box((x, 0.0, 0.5), (0.3, 1000.0, 1.0)) for x in (2.0, 5.0))
+    config = replace(QUICK, planner=BasePlannerConfig(), patience=15, wait=60.0, time_limit=40.0)
+    drive(
+        robot,
+        lambda: FREE if robot.time < 3.0 else near if robot.time < 10.0 else far,
+        config,
+        goal=np.array(goal),
+    )
+    assert 3.0 < robot.state[0] < 4.0, "not all the way is free, but the next part"
+
+
 def test_what_came_and_stays_is_given_up() -> None:
     robot = Unicycle()
     config = replace(QUICK, planner=BasePlannerConfig(), time_limit=200.0)
@@ -102,14 +152,13 @@ def test_what_came_and_stays_is_given_up() -> None:
     # It comes before the robot is where it comes to.
     _, report = drive(robot, lambda: shut if robot.time > 4.5 else FREE, config, goal=GOAL.double().numpy())
     assert report.status is DriveStatus.UNREACHABLE, report.message
-    assert robot.state[0] < 1.0
+    assert robot.state[0] < 1.7 - BODY.radius
 
 
 @pytest.mark.parametrize(
     "values",
     [
-        {"memory_came": 0.0},
-        {"memory_came": math.nan},
+        {"looks_came": 0},
         {"stand_off": -0.1},
         {"wary": -0.01},
         {"wary": math.nan},
@@ -118,3 +167,14 @@ def test_what_came_and_stays_is_given_up() -> None:
 def test_bad_ways_of_waiting_are_refused(values: dict) -> None:
     with pytest.raises(Exception, match=next(iter(values))):
         BasePlannerConfig(**values)
+
+
+@pytest.mark.parametrize(("came", "looks"), [(False, 3), (True, 8)])
+def test_other_places_are_tried_later_where_something_came(came: bool, looks: int) -> None:
+    planner, near = BasePlanner(BODY, BasePlannerConfig(stand_off=0.0)), torch.tensor([1.4, 0.0])
+    if came:
+        planner.plan(near, GOAL, FREE)
+    tries = [planner.plan(near, GOAL, BARRIER, now=1.0 + n) for n in range(looks + 1)]
+    entries = torch.stack([plan.onward[0] for plan in tries])
+    assert (entries[:looks] - entries[0]).norm(dim=1).max() < 0.3
+    assert (entries[looks] - entries[0]).norm() > 0.5
