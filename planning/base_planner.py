@@ -14,6 +14,7 @@ from planning.chomp import Chomp, ChompConfig
 from planning.errors import ConfigError
 from planning.explored import ExploredField, Trodden
 from planning.grid_search import GridSearchConfig, Route, grid_search
+from planning.numbers import refuse_nan
 from planning.once_free import OnceFree
 from planning.protocols import ConfidentField, DistanceField, ObservingField, SphereRobot
 from planning.result import PlanResult
@@ -69,9 +70,10 @@ class BasePlannerConfig:
     room: float = 0.5
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         positive = (self.clearance_change, self.off_path, self.memory, self.room)
         good = (
-            all(value > 0 for value in positive)  # NaN is not
+            all(value > 0 for value in positive)
             and self.stand_off >= 0
             and self.wary >= 0
             and self.num_waypoints >= 3

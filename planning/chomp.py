@@ -19,6 +19,7 @@ from planning.errors import ConfigError, TrajectoryError
 from planning.hamiltonian import shaken
 from planning.limits import project_to_limits
 from planning.metric import Metric, MetricConfig
+from planning.numbers import refuse_nan
 from planning.objective import Objective, ObjectiveConfig
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
@@ -64,6 +65,7 @@ class ChompConfig:
     constraint_tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if min(self.eps, self.descent.step, self.descent.max_update) <= 0 or self.descent.patience < 1:
             raise ConfigError(
                 f"ChompConfig: eps, step, max_update and patience must be positive, got {self}."

@@ -18,6 +18,7 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from planning.errors import ConfigError
+from planning.numbers import refuse_nan
 from planning.recent_points import RecentPoints
 
 logger = logging.getLogger(__name__)
@@ -77,6 +78,7 @@ class CollisionMonitorConfig:
     reach: float = 2.0
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         positive = (self.braking, self.max_age, self.reach)
         if not (
             min(positive) > 0

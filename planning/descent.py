@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from planning.numbers import refuse_nan
 from planning.objective import Evaluation, Objective
 
 
@@ -31,6 +32,9 @@ class DescentConfig:
     tolerance: float = 1e-2
     patience: int = 10
     polish: int = 50
+
+    def __post_init__(self) -> None:
+        refuse_nan(self)
 
 
 @dataclass(frozen=True, eq=False)

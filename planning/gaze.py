@@ -15,6 +15,7 @@ from numpy import ndarray
 
 from planning.drive import MobileRobot
 from planning.errors import ConfigError
+from planning.numbers import refuse_nan
 
 # A path shorter than this [m] is at its end: what counts is what lies ahead.
 AT_THE_END = 0.5
@@ -43,8 +44,9 @@ class GazeConfig:
     nod: float = 0.5
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         positive = [self.near, self.nod, *(distance for distance, _ in self.looks)]
-        if not self.looks or not all(value > 0 for value in positive):  # NaN is not
+        if not self.looks or not all(value > 0 for value in positive):
             raise ConfigError(
                 "GazeConfig: looks must not be empty, and their distances, near and nod must be positive, got "
                 f"looks {self.looks}, near {self.near:g} m and nod {self.nod:g} s."

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from planning.errors import ConfigError
 from planning.hand_room import ParallelHand, RoomRound
+from planning.numbers import refuse_nan
 from planning.object_surface import ObjectSurface
 from planning.protocols import DistanceField
 from planning.threads import one_thread
@@ -71,6 +72,7 @@ class GraspConfig:
     most: int = 40
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if min(self.headings, self.anchors, self.most, self.pad) <= 0 or not (self.pitches and self.bites):
             raise ConfigError(
                 f"GraspConfig: headings, anchors, most and pad must be positive, pitches and bites given, got {self}."

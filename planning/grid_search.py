@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from planning.errors import ConfigError, TrajectoryError
+from planning.numbers import refuse_nan
 from planning.protocols import DistanceField, SphereRobot
 from planning.workspace import Workspace, WorkspaceConfig
 
@@ -52,6 +53,7 @@ class GridSearchConfig:
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         prices = min(self.caution, self.through_blocked, self.through_unknown)
         if min(self.spacing, self.padding) <= 0 or self.margin <= self.least_margin or not prices >= 1:
             raise ConfigError(

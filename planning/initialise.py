@@ -17,6 +17,7 @@ from torch import Tensor
 
 from planning.errors import ConfigError, TrajectoryError
 from planning.exact_shape import exact_shape
+from planning.numbers import refuse_nan
 from planning.protocols import CostField, DistanceField, SelfCollidingRobot, SphereRobot
 from planning.validation import within_limits
 from planning.workspace import Workspace, WorkspaceConfig
@@ -71,6 +72,7 @@ class RrtConfig:
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if not (0 < self.resolution <= self.reach) or self.batch < 1:
             raise ConfigError(
                 f"RrtConfig: 0 < resolution <= reach and batch >= 1 are needed, got "

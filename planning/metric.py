@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from planning.errors import ConfigError
+from planning.numbers import refuse_nan
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class MetricConfig:
     ridge: float = 1e-6
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         weights = (self.velocity, self.acceleration, self.jerk)
         if min(weights) < 0 or max(weights) == 0 or self.ridge < 0:
             raise ConfigError(

@@ -18,6 +18,7 @@ from torch import Tensor
 from planning.errors import ConfigError, FieldError
 from planning.hidden_sides import hidden_sides
 from planning.line_of_sight import in_sight
+from planning.numbers import refuse_nan
 from planning.protocols import ConfidentField, DistanceField
 from planning.threads import one_thread
 
@@ -57,6 +58,7 @@ class SurfaceConfig:
     confidence: float = 0.75
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if (
             not min(self.radius, self.around, self.samples, self.accuracy, self.above, self.near, self.gap)
             > 0

@@ -12,6 +12,7 @@ from torch import Tensor
 from planning.costs import arc_length_cost, hinge_cost, self_collision_cost
 from planning.errors import ConfigError
 from planning.metric import Metric
+from planning.numbers import refuse_nan
 from planning.protocols import LinkedRobot, SelfCollidingRobot, SphereRobot
 from planning.sphere_kinematics import kinematics_of
 from planning.workspace import Workspace
@@ -37,6 +38,7 @@ class ObjectiveConfig:
     margin: float = 0.005
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         weights = (self.smoothness_weight, self.obstacle_weight, self.self_collision_weight)
         if min(weights) < 0 or self.self_collision_eps <= 0:
             raise ConfigError(

@@ -16,6 +16,7 @@ from planning.ends import check_ends, offered
 from planning.errors import ConfigError, TrajectoryError
 from planning.exact_shape import exact_shape
 from planning.initialise import NoPath, RrtConfig, rrt_connect
+from planning.numbers import refuse_nan
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
 from planning.threads import one_thread
@@ -47,6 +48,7 @@ class PlannerConfig:
     rrt: RrtConfig = field(default_factory=RrtConfig)
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if self.num_waypoints < 3:
             raise ConfigError(f"PlannerConfig: num_waypoints must be at least 3, got {self.num_waypoints}.")
 

@@ -20,6 +20,7 @@ from planning.drive_path import driveable
 from planning.ends import check_ends
 from planning.errors import ConfigError
 from planning.linear_clearance import ClearanceModel
+from planning.numbers import refuse_nan
 from planning.protocols import CostField, DistanceField, SphereRobot
 from planning.result import PlanResult, Status
 from planning.timing import UNLIMITED, retime
@@ -62,6 +63,7 @@ class RefineConfig:
     validation: ValidationConfig = field(default_factory=ValidationConfig)
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if len(self.base_joints) not in (0, 3):
             raise ConfigError(
                 f"RefineConfig: base_joints must name x, y and yaw, or be empty, got {self.base_joints}."

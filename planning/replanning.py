@@ -26,6 +26,7 @@ from planning.errors import ConfigError
 from planning.gaze import Gaze, GazeConfig
 from planning.giving_way import GivingWay, length_left, path_length
 from planning.grid_search import Route
+from planning.numbers import refuse_nan
 from planning.protocols import DistanceField, SphereRobot
 from planning.result import PlanResult
 from planning.tracking import BaseTracker, TrackerConfig
@@ -70,9 +71,10 @@ class ReplanningConfig:
     time_limit: float = 180.0
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         positive = ("scan_rate", "retry", "wait", "detour", "extend", "stuck", "time_limit")
         values = [getattr(self, name) for name in positive]
-        if not all(value > 0 for value in values):  # NaN is not
+        if not all(value > 0 for value in values):
             got = ", ".join(f"{name} {value:g}" for name, value in zip(positive, values, strict=True))
             raise ConfigError(f"ReplanningConfig: these must be positive: {got}.")
 

@@ -12,6 +12,7 @@ from planning.chomp import ChompConfig
 from planning.descent import DescentConfig
 from planning.errors import ProblemError
 from planning.initialise import RrtConfig
+from planning.numbers import refuse_nan
 from planning.objective import ObjectiveConfig
 from planning.plan import Planner, PlannerConfig
 from planning.problems import Problem
@@ -79,6 +80,9 @@ class SolveConfig:
     planner: PlannerConfig = field(default_factory=_planner)
     acceleration_time: float = 0.5
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        refuse_nan(self)
 
 
 class Solver:

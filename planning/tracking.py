@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from planning.errors import ConfigError, TrajectoryError
+from planning.numbers import refuse_nan
 from planning.path_reference import MotionLimits, PathReference, wrapped
 from planning.unicycle_mpc import MpcWeights, UnicycleMpc
 
@@ -57,6 +58,7 @@ class TrackerConfig:
     weights: MpcWeights = field(default_factory=MpcWeights)
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         positive = (
             self.max_speed,
             self.max_yaw_rate,

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from planning.errors import ConfigError, TrajectoryError
 from planning.exact_shape import exact_shape
+from planning.numbers import refuse_nan
 from planning.protocols import CostField, DistanceField, LinkedRobot, SelfCollidingRobot, SphereRobot
 from planning.result import Status
 from planning.sphere_kinematics import kinematics_of
@@ -43,6 +44,7 @@ class ValidationConfig:
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if self.max_step <= 0 or self.max_joint_step <= 0:
             raise ConfigError(
                 f"ValidationConfig: max_step and max_joint_step must be positive, got "

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from planning.costs import hinge_cost
 from planning.errors import ConfigError, FieldError
+from planning.numbers import refuse_nan
 from planning.protocols import (
     CompilableField,
     ConfidentField,
@@ -41,6 +42,7 @@ class WorkspaceConfig:
     chunk: int = 100_000
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if self.floor_tolerance < 0 or self.chunk < 1:
             raise ConfigError(
                 f"WorkspaceConfig: floor_tolerance must be >= 0 m and chunk >= 1, "

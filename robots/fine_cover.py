@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from robots.link_geometry import collision_pieces
 from robots.mesh_paths import cache_dir
+from robots.numbers import refuse_nan
 
 Balls = Float[np.ndarray, "n 4"]
 
@@ -40,6 +41,9 @@ class FineCoverConfig:
     spacing: float = 0.003
     largest: float = 0.04
     large_area: float = 0.12
+
+    def __post_init__(self) -> None:
+        refuse_nan(self)
 
 
 def fine_cover(urdf: str | Path, config: FineCoverConfig | None = None) -> dict[str, Balls]:

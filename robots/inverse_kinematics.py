@@ -11,6 +11,7 @@ from torch import Tensor
 
 from robots.errors import RobotError, UnknownJointError
 from robots.model import Robot
+from robots.numbers import refuse_nan
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,9 @@ class IkConfig:
         1.0  # [rad | m] of the first half of the restarts about the seed; the rest is uniform
     )
     length: float = 0.3  # [m] an orientation error of 1 rad weighs as much as a position error of this
+
+    def __post_init__(self) -> None:
+        refuse_nan(self)
 
 
 @dataclass(frozen=True)

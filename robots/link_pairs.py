@@ -13,6 +13,7 @@ from torch import Tensor
 from robots.convex_shape import Shape
 from robots.link_geometry import collision_pieces
 from robots.model import Robot
+from robots.numbers import refuse_nan
 
 Reason = Literal["adjacent", "always", "never"]
 
@@ -26,6 +27,9 @@ class PairConfig:
     never_margin: float = 0.01  # [m] a pair counts as never colliding only if it stays this far apart
     always_share: float = 0.95  # a pair in collision this often is an artefact of overlapping spheres
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        refuse_nan(self)
 
 
 def untested_pairs(robot: Robot, config: PairConfig | None = None) -> frozenset[frozenset[str]]:

@@ -15,6 +15,7 @@ from robots.kinematic_tree import KinematicTree
 from robots.link_geometry import collision_pieces
 from robots.link_pairs import PairConfig, untested_pairs
 from robots.model import Robot
+from robots.numbers import refuse_nan
 from robots.sphere_fitting import GrowingCover, SphereFit
 from robots.spheres import SphereSet
 
@@ -32,6 +33,9 @@ class RobotFitConfig:
     gap: float = 0.001  # [m] that geometry may stand out of the spheres: it spares many at edges and corners
     seed: int = 0
     pairs: PairConfig = field(default_factory=PairConfig)
+
+    def __post_init__(self) -> None:
+        refuse_nan(self)
 
 
 def fit_robot(

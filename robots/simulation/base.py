@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robots.errors import RobotError
+from robots.numbers import refuse_nan
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class DriveConfig:
     """Torque of the drive about the vertical [N m]."""
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         for name, value in vars(self).items():
             if not value > 0:
                 raise RobotError(f"DriveConfig.{name} must be positive, got {value}")

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from robots.errors import RobotError
+from robots.numbers import refuse_nan
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class DepthNoiseConfig:
     """Farther depths [m] are returned as 0."""
 
     def __post_init__(self) -> None:
+        refuse_nan(self)
         if min(self.disparity_step, self.disparity_sigma, self.pixel_sigma, self.distortion) < 0:
             raise RobotError(f"noise magnitudes must not be negative, got {self}")
         if min(self.native_width, self.baseline_focal, self.max_range, self.distortion_waves) <= 0:

@@ -12,6 +12,7 @@ import pybullet
 from jaxtyping import Float
 
 from robots.errors import RobotError
+from robots.numbers import refuse_nan
 from robots.simulation.articulation import Articulation, Joint, JointVector
 from robots.simulation.base import DifferentialDrive, DriveConfig, planar_velocity
 
@@ -56,6 +57,9 @@ class MotorConfig:
     """[N/m] of a finger pad; soft enough to give a steady grip, 0.7 mm at 20 N."""
     finger_damping: float = 1000.0
     """[N s/m]."""
+
+    def __post_init__(self) -> None:
+        refuse_nan(self)
 
 
 class SimulatedRobot(Articulation):
