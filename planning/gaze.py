@@ -23,8 +23,9 @@ AT_THE_END = 0.5
 FACING = 0.3
 # The neck turns so far [rad] that what is beside the robot comes into view, at least at the edge.
 NECK = 1.6
-# Height [m] at which those who stand about are looked at.
-CHEST = 1.0
+# Those who stand about are looked at in this height [m], as if they were at least so far away [m]: a look down at the
+# feet of somebody close by does not show whether he is still there.
+CHEST, CLOSE = 1.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,14 @@ class Gaze:
         """Look at one of the points [m] in turn, and after them at one of the two nearest bystanders."""
         others = [place for place in self.bystanders if self._in_reach(place, state)][:2]
         turn, step = divmod(int(self.robot.time / self.config.nod), len(looks) + bool(others))
-        point = looks[step] if step < len(looks) else (*others[turn % len(others)], CHEST)
+        point = looks[step] if step < len(looks) else self._at_level(others[turn % len(others)], state)
         self.robot.look_at(np.array(point, dtype=float))
+
+    @staticmethod
+    def _at_level(place: Float[ndarray, "2"], state: Float[ndarray, "3"]) -> tuple[float, ...]:
+        away = place - state[:2]
+        far = max(1.0, CLOSE / max(float(np.linalg.norm(away)), 1e-6))
+        return *(state[:2] + far * away), CHEST
 
     def _in_reach(self, place: Float[ndarray, "2"], state: Float[ndarray, "3"]) -> bool:
         away = place - state[:2]

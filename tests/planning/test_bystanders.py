@@ -100,3 +100,15 @@ def test_while_it_waits_it_looks_at_what_came_even_where_no_way_is_left_to_try()
     late = [look for look in robot.looked_at if look[2] < 1.1][-20:]
     assert abs(math.remainder(robot.state[2], 2 * math.pi)) < 0.5
     assert all(look[0] > robot.state[0] for look in late)
+
+
+def test_somebody_right_before_the_camera_is_not_looked_at_from_above() -> None:
+    robot = Unicycle((0.5, 0.0, 0.2))
+    gaze = Gaze(robot, GazeConfig(nod=0.1))
+    gaze.bystanders = np.array([[0.5, 0.4]])
+    for _ in range(20):
+        gaze.towards(robot.state, 0.2)
+        robot.time += 0.1
+    glances = [look for look in robot.looked_at if abs(look[0] - 0.5) < 1e-6]
+    assert len(glances) >= 4
+    assert all(look[1] >= 1.0 - 1e-6 and look[2] == 1.0 for look in glances), "the same way, but farther"
