@@ -37,7 +37,7 @@ MET = 0.002
 """Fingers with less than this between them [m] have met."""
 LIFTED, HELD_FOR = 0.10, 2.0
 """What counts as lifted [m], and for how long it is held [s]."""
-CLOSE = isdf.MapperConfig(voxel=0.008, truncation=0.031, refresh_period=math.inf, guess_period=math.inf)
+CLOSE = isdf.MapperConfig(voxel=0.004, truncation=0.031, refresh_period=math.inf, guess_period=math.inf)
 """The map of the object alone: fingers need it finer than wheels do. It is read once, after all images."""
 NEAR = 0.45
 """What is farther from the object than this [m] is left out of its map."""

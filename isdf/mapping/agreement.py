@@ -15,8 +15,8 @@ from .lattice import LatticeArrays
 CLEAR, CLEAR_NOISE = 0.09, 0.015
 # Confidence (255 is 1) above which the map is believed.
 SURE = 150
-# Voxels before a measured point that are searched for a solid the ray would have had to pass.
-BACK = 8
+# How far before a measured point a solid is searched for that the ray would have had to pass [m].
+BACK = 0.32
 
 
 @njit(cache=True, nogil=True)
@@ -41,6 +41,7 @@ def compare(lattice: LatticeArrays, bricks: Bricks, depth, stride, intrinsics, T
     rows, columns = -(-depth.shape[0] // stride), -(-depth.shape[1] // stride)
     appeared = np.zeros((rows, columns), dtype=np.bool_)
     known, against, valid = 0, 0, 0
+    steps = int(np.ceil(BACK / bricks.voxel))
     ray, point = np.empty(3), np.empty(3)
     for row in range(rows):
         for column in range(columns):
@@ -61,7 +62,7 @@ def compare(lattice: LatticeArrays, bricks: Bricks, depth, stride, intrinsics, T
                 against += 1
                 continue
             through = False
-            for n in range(1, BACK + 1):
+            for n in range(1, steps + 1):
                 at = (z - clear - (n - 1) * bricks.voxel) / bricks.voxel
                 value, weight = voxel_at(
                     bricks,

@@ -25,7 +25,7 @@ class Bricks(NamedTuple):
         corner: (3,) lattice index of the table's first brick.
         distance: (bricks, 512) float32 [m].
         weight: (bricks, 512) float32.
-        ended: (bricks, 512) float32, share of the views, by weight, that ended there, see `isdf.mapping.fusion.HIDDEN`.
+        ended: (bricks, 512) float32, share of the views, by weight, that ended within a voxel of it.
         voxel: edge of a voxel [m].
     """
 

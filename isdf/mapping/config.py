@@ -9,7 +9,7 @@ from ..errors import ConfigError
 from ..numbers import require_finite
 
 # Four times the default limit; a brick takes six kilobytes, though most places never get one.
-MOST_BRICKS = 1 << 25
+MOST_BRICKS = 1 << 27
 
 
 @dataclass(frozen=True)
@@ -17,11 +17,13 @@ class MapperConfig:
     """Settings of the default map.
 
     Args:
-        voxel: edge of a fine voxel [m]; the coarse nodes lie four of them apart, and the network knows no other.
+        voxel: edge of a voxel of the fused surfaces [m]; the nodes of the distances lie two of them apart where they
+            are finest and eight elsewhere, and the network knows no other.
         truncation: least truncation of the fused distances [m].
         truncation_noise: truncation per squared depth [m / m^2]: it follows the noise of far depth.
         max_depth: pixels measured farther than this are ignored [m].
         max_weight: of a voxel, in measurements at 1 m: enough to average the noise.
+        fuse_period: least frame time between two images that are fused [s]: those between show hardly more.
         refresh_period: least frame time between two refreshes of the distances [s].
         guess_period: least frame time between two runs of the network [s].
         visitors: what came into free space, was not seen to stay and has been out of view for this long [s] is taken
@@ -29,15 +31,16 @@ class MapperConfig:
         max_bricks: a frame that needs a larger table of bricks (of eight voxels a side) is refused.
     """
 
-    voxel: float = 0.04
-    truncation: float = 0.1
+    voxel: float = 0.02
+    truncation: float = 0.06
     truncation_noise: float = 0.012
     max_depth: float = 10.0
     max_weight: float = 20.0
-    refresh_period: float = 0.3
+    fuse_period: float = 0.05
+    refresh_period: float = 0.25
     guess_period: float = 1.0
     visitors: float | None = None
-    max_bricks: int = 8_000_000
+    max_bricks: int = 32_000_000
 
     def __post_init__(self) -> None:
         require_finite(
@@ -62,6 +65,6 @@ class MapperConfig:
             raise ConfigError(
                 f"truncation must be more than two voxels, got {self.truncation} m with a voxel of {self.voxel} m"
             )
-        for name in ("refresh_period", "guess_period", "truncation_noise"):
+        for name in ("fuse_period", "refresh_period", "guess_period", "truncation_noise"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be zero or more, got {getattr(self, name)}")

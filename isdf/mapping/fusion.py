@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numba import njit
 from scipy.ndimage import minimum_filter
 
-from .bricks import Bricks
+from .bricks import SIDE, VOXELS, Bricks
 
 # Nearer than this [m] the noise of depth cameras no longer falls with the square of the depth.
 NOISE_FLOOR_DEPTH = 0.5
@@ -22,9 +22,10 @@ NOISE_FLOOR_DEPTH = 0.5
 TRUST, TRUST_SEEN_THROUGH = 8.0, 1.0
 # How far around, as the tangent of an angle, and how far behind, in truncations.
 AROUND, FAR_BEHIND = 0.015, 1.5
-# Evidence of a surface that a view gives which ends before a voxel, beside 1 of one that ends within a voxel of it and
-# none of one that goes on behind it: the thing that hides the voxel may reach as far.
-HIDDEN = 0.3
+# Voxels nearer to the camera's plane than this [m] are not looked at.
+NEAREST = 0.05
+# Pixels a side of the tiles of an image whose greatest depths tell which bricks are hidden.
+TILE = 16
 
 
 def nearest_around(depth: Float[np.ndarray, "h w"], focal: float) -> Float[np.ndarray, "h w"]:
@@ -34,7 +35,9 @@ def nearest_around(depth: Float[np.ndarray, "h w"], focal: float) -> Float[np.nd
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, intrinsics, T_camera_world):
+def fuse(
+    bricks: Bricks, begin, end, depth, around, hides, noise, least, max_weight, intrinsics, T_camera_world
+):
     """Average one depth image into the stored voxels of a box of bricks, in place.
 
     Args:
@@ -43,72 +46,138 @@ def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, in
         end: (3,) one past its last.
         depth: (h, w) float32 z-depth [m], 0 = unknown.
         around: (h, w) float32, `nearest_around` of it.
+        hides: (h, w) float32: this far behind what was measured [m] nothing is free any more, for it has just come.
         noise: truncation per squared depth.
         least: least truncation [m].
         max_weight: limit of a voxel's weight.
         intrinsics: fx, fy, cx, cy.
         T_camera_world: (4, 4).
     """
-    fx, fy, cx, cy = intrinsics
-    height, width = depth.shape
-    R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
     table, corner, distances, weights, ended, voxel = bricks
-    radius = 7.0 * voxel
+    K, T = np.array(intrinsics, dtype=np.float32), T_camera_world.astype(np.float32)
+    bands, first = (
+        np.array((noise, least, max_weight, voxel), dtype=np.float32),
+        np.empty(3, dtype=np.float32),
+    )
+    deepest, behind = _deepest(depth), hides.max()
+    pixels, z = np.empty(VOXELS, dtype=np.int32), np.empty(VOXELS, dtype=np.float32)
     for bi in range(begin[0], end[0]):
         for bj in range(begin[1], end[1]):
             for bk in range(begin[2], end[2]):
                 brick = table[bi, bj, bk]
                 if brick < 0:
                     continue
-                x0, y0, z0 = (
-                    voxel * 8 * (corner[0] + bi), voxel * 8 * (corner[1] + bj), voxel * 8 * (corner[2] + bk)
-                )  # fmt: skip
-                xm, ym, zm = x0 + 3.5 * voxel, y0 + 3.5 * voxel, z0 + 3.5 * voxel
-                px = R[0, 0] * xm + R[0, 1] * ym + R[0, 2] * zm + t[0]
-                py = R[1, 0] * xm + R[1, 1] * ym + R[1, 2] * zm + t[1]
-                pz = R[2, 0] * xm + R[2, 1] * ym + R[2, 2] * zm + t[2]
-                if pz < -radius:
-                    continue
-                if pz > radius:
-                    reach = radius * 1.5 / (pz - radius + 1e-3)
-                    if abs(px / pz * fx + cx - width / 2) > width / 2 + reach * fx:
-                        continue
-                    if abs(py / pz * fy + cy - height / 2) > height / 2 + reach * fy:
-                        continue
-                for i in range(8):
-                    for j in range(8):
-                        x, y = x0 + voxel * i, y0 + voxel * j
-                        ax = R[0, 0] * x + R[0, 1] * y + t[0]
-                        ay = R[1, 0] * x + R[1, 1] * y + t[1]
-                        az = R[2, 0] * x + R[2, 1] * y + t[2]
-                        for k in range(8):
-                            w = z0 + voxel * k
-                            z = az + R[2, 2] * w
-                            if z < 0.05:
-                                continue
-                            u = int(np.floor((ax + R[0, 2] * w) / z * fx + cx + 0.5))
-                            v = int(np.floor((ay + R[1, 2] * w) / z * fy + cy + 0.5))
-                            if u < 0 or v < 0 or u >= width or v >= height:
-                                continue
-                            measured = depth[v, u]
-                            if measured <= 0:
-                                continue
-                            band = max(least, noise * measured * measured)
-                            ahead = measured - z
-                            if ahead <= -band:
-                                continue
-                            far = max(measured, NOISE_FLOOR_DEPTH)
-                            # Behind a surface less and less is known; what is there may be seen from its other side.
-                            fade = min(1.0, (ahead + band) / (band - voxel))
-                            weight = fade / (far * far * far * far)
-                            at = i * 64 + j * 8 + k
-                            old, before = distances[brick, at], weights[brick, at]
-                            value = min(ahead, band)
-                            if abs(value - old) > 0.75 * band:
-                                through = around[v, u] - z > FAR_BEHIND * band
-                                before = min(before, (TRUST_SEEN_THROUGH if through else TRUST) * weight)
-                            total = before + weight
-                            distances[brick, at] = (old * before + value * weight) / total
-                            weights[brick, at] = min(total, max_weight)
-                            kind = np.float32(1 if abs(ahead) <= voxel else (HIDDEN if ahead < 0 else 0))
-                            ended[brick, at] = (ended[brick, at] * before + kind * weight) / total
+                first[0] = voxel * SIDE * (corner[0] + bi)
+                first[1] = voxel * SIDE * (corner[1] + bj)
+                first[2] = voxel * SIDE * (corner[2] + bk)
+                if _may_change(first, bands, deepest, behind, depth.shape, K, T):
+                    _project(first, bands[3], depth.shape, K, T, pixels, z)
+                    _average(
+                        distances[brick], weights[brick], ended[brick], pixels, z, depth.ravel(), around.ravel(),
+                        hides.ravel(), bands,
+                    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _deepest(depth):
+    """Greatest depth [m] in every tile of an image."""
+    height, width = depth.shape
+    out = np.zeros((-(-height // TILE), -(-width // TILE)), dtype=np.float32)
+    for v in range(height):
+        for u in range(width):
+            out[v // TILE, u // TILE] = max(out[v // TILE, u // TILE], depth[v, u])
+    return out
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _may_change(first, bands, deepest, behind, shape, K, T):
+    """Whether the ball about a brick is in view and not wholly hidden: (3,) `first` is its first voxel [m]."""
+    noise, least, voxel = bands[0], bands[1], bands[3]
+    half = np.float32(0.5 * (SIDE - 1)) * voxel
+    radius = np.float32(1.7321) * half
+    x, y, z = first[0] + half, first[1] + half, first[2] + half
+    px = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    py = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    pz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    near = pz - radius
+    if pz + radius < NEAREST:
+        return False
+    if near < NEAREST:
+        return True
+    # No point of the ball is farther from its middle in the image, for none is nearer than `near`.
+    reach = radius * (1 + max(abs(px), abs(py)) / pz) / near
+    low_u, high_u = (px / pz - reach) * K[0] + K[2] - 1, (px / pz + reach) * K[0] + K[2] + 1
+    low_v, high_v = (py / pz - reach) * K[1] + K[3] - 1, (py / pz + reach) * K[1] + K[3] + 1
+    if high_u < 0 or high_v < 0 or low_u >= shape[1] or low_v >= shape[0]:
+        return False
+    u0, u1 = max(0, int(low_u)) // TILE, min(shape[1] - 1, int(high_u)) // TILE
+    v0, v1 = max(0, int(low_v)) // TILE, min(shape[0] - 1, int(high_v)) // TILE
+    for v in range(v0, v1 + 1):
+        for u in range(u0, u1 + 1):
+            far = deepest[v, u]
+            if far > 0 and near < far + max(least, noise * far * far, behind):
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _project(first, voxel, shape, K, T, pixels, z):
+    """Write which pixel every voxel of a brick falls on, -1 if on none, and its z-depth [m]; made to be vectorised."""
+    width, high, wide = np.int32(shape[1]), np.float32(shape[0]), np.float32(shape[1])
+    half, one = np.float32(0.5), np.float32(1)
+    fx, fy, cx, cy = K[0], K[1], K[2] + half, K[3] + half
+    r0, r1, r2 = voxel * T[0, 2], voxel * T[1, 2], voxel * T[2, 2]
+    for i in range(SIDE):
+        for j in range(SIDE):
+            x, y = first[0] + voxel * np.float32(i), first[1] + voxel * np.float32(j)
+            ax = T[0, 0] * x + T[0, 1] * y + T[0, 2] * first[2] + T[0, 3]
+            ay = T[1, 0] * x + T[1, 1] * y + T[1, 2] * first[2] + T[1, 3]
+            az = T[2, 0] * x + T[2, 1] * y + T[2, 2] * first[2] + T[2, 3]
+            for k in range(SIDE):
+                step = np.float32(k)
+                depth = az + r2 * step
+                inverse = one / max(depth, np.float32(NEAREST))
+                u, v = (ax + r0 * step) * inverse * fx + cx, (ay + r1 * step) * inverse * fy + cy
+                seen = (depth >= np.float32(NEAREST)) & (u >= 0) & (v >= 0) & (u < wide) & (v < high)
+                at = (i * SIDE + j) * SIDE + k
+                z[at] = depth
+                pixels[at] = np.int32(v) * width + np.int32(u) if seen else np.int32(-1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _average(distances, weights, ended, pixels, z, depth, around, hides, bands):
+    """Average what an image measures into the voxels (512,) of a brick."""
+    noise, least, max_weight, voxel = bands
+    floor, one = np.float32(NOISE_FLOOR_DEPTH), np.float32(1)
+    for at in range(VOXELS):
+        pixel = pixels[at]
+        if pixel < 0:
+            continue
+        measured = depth[pixel]
+        if measured <= 0:
+            continue
+        band = max(least, noise * measured * measured)
+        ahead = measured - z[at]
+        if ahead <= -band:
+            # What was free here is hidden in something that has come; surfaces may still be there behind it.
+            if ahead > -hides[pixel] and distances[at] > np.float32(0.75) * least:
+                weights[at] = 0
+            continue
+        far = max(measured, floor)
+        # Behind a surface less and less is known; what is there may be seen from its other side.
+        weight = min(one, (ahead + band) / (band - voxel)) / (far * far * far * far)
+        old, before = distances[at], weights[at]
+        value = min(ahead, band)
+        if abs(value - old) > np.float32(0.75) * band:
+            through = around[pixel] - z[at] > np.float32(FAR_BEHIND) * band
+            before = min(before, np.float32(TRUST_SEEN_THROUGH if through else TRUST) * weight)
+        total = before + weight
+        share = weight / total
+        distances[at] = old + (value - old) * share
+        weights[at] = min(total, max_weight)
+        kind = one if abs(ahead) <= voxel else np.float32(0)
+        ended[at] += (kind - ended[at]) * share

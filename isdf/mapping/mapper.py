@@ -25,7 +25,7 @@ from .agreement import compare
 from .bricks import BrickVolume, missing_bricks
 from .completion import load_network
 from .config import MapperConfig
-from .evidence import look_through
+from .evidence import INSIDE, look_through
 from .field import LatticeField
 from .footprint import clear
 from .fusion import fuse, nearest_around
@@ -38,8 +38,8 @@ from .visitors import Visitors
 
 logger = logging.getLogger(__name__)
 
-# Fine voxels between the nodes of the coarse lattice.
-RATIO = 4
+# Voxels between the nodes of the coarse lattice.
+RATIO = 8
 # The map reaches this far beyond what was seen, across and along the vertical [m].
 BEYOND_ACROSS, BEYOND_ALONG = 2.5, 1.5
 # Distances are written anew this far outside what a frame looked at [m].
@@ -72,13 +72,13 @@ class Mapper(ShownMapper):
         self.config, self.device = config, device
         self.bricks = BrickVolume(self.config.voxel, self.config.max_bricks)
         self.lattice = Lattice(RATIO * self.config.voxel)
-        self.visitors = Visitors(self.bricks, self.lattice, self.config.visitors)
+        self.visitors = Visitors(self.bricks, self.lattice, self.config.truncation, self.config.visitors)
         self.network = load_network().to(self.device)
         self.frames_seen = self.frames_skipped = self.steps = 0
         self.up = np.zeros(3)
         self._bounds = nothing_seen()
         self._viewed: np.ndarray | None = None
-        self._refreshed_at = self._guessed_at = -math.inf
+        self._fused_at = self._refreshed_at = self._guessed_at = -math.inf
         self._ready = False
         self._last: np.ndarray | None = None
         self._frozen, self._refused, self._motion = False, 0, Motion()
@@ -108,6 +108,10 @@ class Mapper(ShownMapper):
         depth, T = self._usable(frame), frame.T_world_camera.numpy()
         if self._repeats(depth, frame.time):
             return
+        if 0 < frame.time - self._fused_at < self.config.fuse_period:
+            self.frames_seen += 1
+            self._keep_up(T[:3, 3], frame.time)
+            return
         stride = max(1, depth.shape[1] // COLUMNS)
         appeared = self._appeared(depth, T, stride, frame)
         if appeared is None:
@@ -125,6 +129,7 @@ class Mapper(ShownMapper):
         floor = float(seen[0 if way > 0 else 1, axis])
         self.visitors.watch(depth, appeared, stride, _intrinsics(frame), T, up, floor, frame.time)
         self._fuse(depth, T, frame, box, appeared, stride)
+        self._fused_at = frame.time
         self._motion.believe(Moment(depth, _intrinsics(frame), T, frame.time))
         self.frames_seen += 1
         feet = self.visitors.stand(depth, _intrinsics(frame), np.linalg.inv(T), up)
@@ -295,11 +300,17 @@ class Mapper(ShownMapper):
         config, bricks, lattice, intrinsics = self.config, self.bricks, self.lattice, _intrinsics(frame)
         band = (config.truncation_noise, config.truncation)
         # At the far end of the range neighbouring rays are still closer than half a brick.
-        sparse = max(1, int(4 * config.voxel * frame.camera.fx / config.max_depth))
+        sparse = max(1, int(4 * bricks.voxel * frame.camera.fx / config.max_depth))
         bricks.add(missing_bricks(bricks.arrays, depth, sparse, *band, intrinsics, T))
         inverse = np.linalg.inv(T)
         around = nearest_around(depth, frame.camera.fx)
-        fuse(bricks.arrays, *bricks.box(*box), depth, around, *band, config.max_weight, intrinsics, inverse)
+        height, width = depth.shape
+        hides = (
+            np.float32(INSIDE) * appeared.repeat(stride, axis=0)[:height].repeat(stride, axis=1)[:, :width]
+        )
+        fuse(
+            bricks.arrays, *bricks.box(*box), depth, around, hides, *band, config.max_weight, intrinsics, inverse
+        )  # fmt: skip
         begin, end = lattice.window(*box)
         evidence = lattice.read("evidence", begin, end)
         first, size = lattice.corner + begin, end - begin
@@ -343,7 +354,9 @@ def compile_kernels() -> None:
     intrinsics, none = _intrinsics(frame), np.empty((0, 4), dtype=np.int64)
     mapper.clear_footprint(np.zeros((1, 3)), np.ones(1))
     mapper.visitors.watch(depth.numpy(), anywhere, 1, intrinsics, T, mapper.up, 1.0, frame.time)
-    extend_down(mapper.bricks.arrays, none, *vertical(mapper.up), depth.numpy(), intrinsics, np.linalg.inv(T))
+    extend_down(
+        mapper.bricks.arrays, none, 1, *vertical(mapper.up), depth.numpy(), intrinsics, np.linalg.inv(T)
+    )
     field = mapper.field()
     for dtype in (torch.float32, torch.float64):
         field.distance_and_gradient(torch.zeros(1, 3, dtype=dtype))

@@ -10,7 +10,7 @@ from numba import njit
 from .bricks import Bricks
 from .evidence import FREE_ABOVE
 from .lattice import BLOCK, FINE, STEP
-from .values import Patches, Window, fused_sign, nearest_patch
+from .values import SOLID, Patches, Window, fused_at, nearest_patch, side_of
 
 # A cell is refined when interpolation misses one of its middles by more than this [m], plus shares of the distance
 # and of what is guessed there.
@@ -23,10 +23,10 @@ WEIGHTS = np.einsum("pa,qb,rc->pqrabc", _part, _part, _part).reshape(8, BLOCK).a
 @njit(cache=True, nogil=True)
 @no_type_check
 def near_known(window: Window, bricks: Bricks):
-    """Which nodes of half the spacing belong to a cell with a corner that was looked through or fused.
+    """Which nodes of half the spacing belong to a cell with a corner that was looked through, fused or near a surface.
 
     Args:
-        window: its evidence is read.
+        window: its evidence and upper bounds are read.
         bricks: the truncated distances.
 
     Returns:
@@ -38,10 +38,9 @@ def near_known(window: Window, bricks: Bricks):
         for j in range(ny):
             for k in range(nz):
                 at = (i * window.ratio, j * window.ratio, k * window.ratio)
-                if (
-                    window.evidence[i, j, k] > FREE_ABOVE
-                    or fused_sign(window, bricks, at, np.float32(1)) != 0
-                ):
+                # Patches reach out from their seeds by less than a step.
+                near = window.upper[i, j, k] < SOLID + window.step
+                if near or window.evidence[i, j, k] > FREE_ABOVE or fused_at(window, bricks, at)[1] > 0:
                     out[
                         max(0, 2 * i - 2) : 2 * i + 3,
                         max(0, 2 * j - 2) : 2 * j + 3,
@@ -76,8 +75,8 @@ def middle_values(window: Window, patches: Patches, bricks: Bricks, where):
                     continue
                 value, seen, free, taken_free, taken_other = _mean_of_corners(window, i, j, k)
                 at = (i * step, j * step, k * step)
-                upper, side, _ = nearest_patch(window, patches, bricks.voxel, at)
-                sign = fused_sign(window, bricks, at, side)
+                upper, side, _ = nearest_patch(window, patches, at)
+                sign = side_of(window, bricks, at, upper, side, seen)
                 line[i, j, k] = value
                 miss[i, j, k] = _fine_value(upper, sign, seen, free, taken_free, taken_other) - value
     return line, miss
@@ -134,8 +133,8 @@ def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corr
                 k * window.ratio + m % FINE,
             )
             value, seen, free, taken_free, taken_other = between[:, m]
-            upper, side, _ = nearest_patch(window, patches, bricks.voxel, at)
-            sign = fused_sign(window, bricks, at, side)
+            upper, side, _ = nearest_patch(window, patches, at)
+            sign = side_of(window, bricks, at, upper, side, seen)
             steps = (_fine_value(upper, sign, seen, free, taken_free, taken_other) - value) / np.float32(STEP)
             steps = max(np.float32(-127), min(np.float32(127), steps))
             corrections[number, m] = int(np.floor(steps + np.float32(0.5)))
@@ -157,7 +156,7 @@ def _fine_value(upper, sign, seen, free, taken_free, taken_other):
     if sign < 0:
         return -upper
     # Free corners tell what to take off in free space, the others what to take off elsewhere.
-    if sign > 0 or seen > FREE_ABOVE:
+    if sign > 0:
         return upper - min(upper, taken_free / free if free > 0 else np.float32(0))
     return upper - min(upper + upper, taken_other / (1 - free) if free < 1 else taken_free)
 

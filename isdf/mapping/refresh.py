@@ -12,7 +12,7 @@ from torch import Tensor
 from .bricks import BrickVolume
 from .completion import STRIDE, CompletionNet, features
 from .evidence import Evidence, bounds, gather
-from .lattice import Lattice
+from .lattice import FINE, Lattice
 from .nearest import finer_nearest
 from .refinement import cells_to_refine, middle_values, near_known, refined_values
 from .seeds import surface_seeds
@@ -24,8 +24,6 @@ MARGIN = 2.5
 # many nodes, so that the network of a fine lattice takes no more memory and time than that of the default one.
 GUESS_ACROSS, GUESS_ALONG = 4.48, 2.56
 NODES_ACROSS, NODES_ALONG = 28, 16
-# Radius of the patch of surface about a seed [voxels]: closes the gaps between the seeds of neighbouring voxels.
-PATCH = 0.5
 
 Box = Float[np.ndarray, "2 3"]
 
@@ -68,7 +66,7 @@ def surroundings(
     spare = (end - begin) % STRIDE
     below = np.where((np.arange(3) == vertical) & upside_down, spare, 0)
     begin, end = begin + below, end - (spare - below)
-    seeds, _, _ = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))
+    seeds = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))[:, :3]
     if len(seeds) == 0 or (end <= begin).any():
         return None
     order = [axis for axis in range(3) if axis != vertical] + [vertical]
@@ -123,15 +121,19 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     """Write the distances and confidences in a box [m] anew; False while there is no surface to measure from."""
     begin, end = lattice.window(box[0], box[1])
     low, high = (lattice.spacing * (lattice.corner + n) for n in (begin, end))
-    centre, normal, weight = surface_seeds(bricks.arrays, *bricks.box(low - MARGIN, high + MARGIN))
-    if len(centre) == 0:
+    seeds = surface_seeds(bricks.arrays, *bricks.box(low - MARGIN, high + MARGIN))
+    if len(seeds) == 0:
         return False
+    centre = seeds[:, :3]
     evidence = lattice.read("evidence", begin, end)
     proven = bounds(centre, evidence, lattice.corner + begin, lattice.spacing)
     window = Window(
         first=lattice.corner + begin,
-        ratio=round(lattice.spacing / bricks.voxel),
+        ratio=FINE - 1,
+        step=lattice.spacing / (FINE - 1),
+        voxels=round(lattice.spacing / (FINE - 1) / bricks.voxel),
         evidence=evidence,
+        upper=proven.upper,
         lower=proven.lower,
         share=lattice.read("share", begin, end).astype(np.float32),
         width=lattice.read("width", begin, end).astype(np.float32),
@@ -145,7 +147,7 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     where = near_known(window, bricks.arrays)
     places = (centre / np.float32(lattice.spacing / 2) - 2 * window.first).astype(np.float32)
     nearest = finer_nearest(places, proven.nearest, where)
-    patches = Patches(centre, normal, weight, PATCH * bricks.voxel, nearest)
+    patches = Patches(seeds, float(seeds[:, 7].max()), nearest)
     coarse_values(window, patches, bricks.arrays)
     line, miss = middle_values(window, patches, bricks.arrays, where)
     refine, stale = np.zeros_like(window.block, dtype=np.bool_), np.zeros_like(window.block, dtype=np.bool_)

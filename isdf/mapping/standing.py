@@ -11,9 +11,9 @@ from numba import njit
 from .bricks import SIDE, Bricks
 from .evidence import BAND
 
-# Nobody's feet are more than so many bricks under what is seen of him.
+# Nobody's feet are more than so many places under what is seen of him. A place is as large as two coarse nodes a side.
 TALL = 6
-# Fewer pixels in a column of bricks show nobody, but the edge of something that was overlooked.
+# Fewer pixels in a column of places show nobody, but the edge of something that was overlooked.
 MANY = 50
 
 
@@ -35,14 +35,14 @@ def feet(
     way: int,
     ground: int,
 ) -> Int[np.ndarray, "n 4"]:
-    """The lowest bricks in which somebody was seen, and how many bricks under each the floor is; none where it is far.
+    """The lowest places where somebody was seen, and how many of them under each the floor is; none where it is far.
 
     Args:
-        pixels: how many show somebody in each brick of the table.
+        pixels: how many show somebody in each place.
         inside: these may be changed.
         axis: the vertical.
         way: 1 if the axis points up, else -1.
-        ground: array index of the bricks of the floor along that axis.
+        ground: index of the places of the floor along that axis.
     """
     lowest: dict[tuple[int, ...], np.ndarray] = {}
     many = np.maximum(pixels, 0).sum(axis=axis, keepdims=True) >= MANY
@@ -59,8 +59,16 @@ def feet(
     return np.concatenate(out)
 
 
+def parts(feet: Int[np.ndarray, "n 4"], side: int, axis: int, way: int) -> Int[np.ndarray, "m 4"]:
+    """The same for bricks, `side` of them a side of a place: the highest brick of each column in the lowest places."""
+    across = np.argwhere(np.ones((side, side), dtype=bool))
+    offsets = np.insert(across, axis, side - 1 if way > 0 else 0, axis=1)
+    first = (side * feet[:, None, :3] + offsets).reshape(-1, 3)
+    return np.column_stack([first, np.repeat(side * feet[:, 3] + side - 1, len(offsets))])
+
+
 def columns(feet: Int[np.ndarray, "n 4"], axis: int, way: int) -> Int[np.ndarray, "m 3"]:
-    """Array indices of the bricks from those of `feet` down so many steps."""
+    """Indices of the places, or bricks, from those of `feet` down so many steps."""
     out = [np.empty((0, 3), dtype=np.int64)]
     for *place, steps in feet:
         column = np.tile(np.array(place), (steps + 1, 1))
@@ -71,12 +79,13 @@ def columns(feet: Int[np.ndarray, "n 4"], axis: int, way: int) -> Int[np.ndarray
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def extend_down(bricks: Bricks, feet, axis, way, depth, intrinsics, T_camera_world):
+def extend_down(bricks: Bricks, feet, own, axis, way, depth, intrinsics, T_camera_world):
     """Go on downwards with the lowest distances of some bricks, but where the image looks.
 
     Args:
         bricks: changed; all that is below is stored.
         feet: (n, 4) array index of each of the bricks and how many bricks to go down.
+        own: so many bricks from there on downwards have been seen themselves.
         axis: the vertical.
         way: 1 if the axis points up, else -1.
         depth: (h, w) float32 z-depth [m], 0 = unknown.
@@ -102,7 +111,7 @@ def extend_down(bricks: Bricks, feet, axis, way, depth, intrinsics, T_camera_wor
                     local[axis] = height if way > 0 else SIDE - 1 - height
                     row = table[brick[0], brick[1], brick[2]]
                     at = local[0] * 64 + local[1] * 8 + local[2]
-                    if down == 0 and weights[row, at] > 0:
+                    if down < own and weights[row, at] > 0:
                         value, weight, end = distances[row, at], weights[row, at], ended[row, at]
                         continue
                     if weight <= 0:

@@ -19,7 +19,7 @@ from .lattice import BLOCK, CHUNK, NODES
 from .mapper import Mapper
 
 FORMAT = "isdf-lattice-map"
-VERSION = 3
+VERSION = 4
 
 
 def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
@@ -55,6 +55,7 @@ def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
         "frames_skipped": mapper.frames_skipped,
         "steps": mapper.steps,
         "ready": mapper._ready,
+        "fused_at": _finite(mapper._fused_at),
         "refreshed_at": _finite(mapper._refreshed_at),
         "guessed_at": _finite(mapper._guessed_at),
     }
@@ -95,6 +96,7 @@ def _restored(tensors: dict[str, Tensor], header: dict[str, Any], device: str | 
     mapper.up = np.array(header["up"], dtype=float).reshape(3)
     mapper.frames_seen, mapper.frames_skipped = int(header["frames_seen"]), int(header["frames_skipped"])
     mapper.steps, mapper._ready = int(header["steps"]), bool(header["ready"])
+    mapper._fused_at = float(header["fused_at"] if header["fused_at"] is not None else -math.inf)
     mapper._refreshed_at = float(header["refreshed_at"] if header["refreshed_at"] is not None else -math.inf)
     mapper._guessed_at = float(header["guessed_at"] if header["guessed_at"] is not None else -math.inf)
     return mapper

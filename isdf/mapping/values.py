@@ -22,23 +22,22 @@ LEAST_OF_ERROR = 0.5
 # However sure the network is of a guess, it may err by this share of the gap more than it expects, and so much [m] at
 # most: rooms differ from those it has learned from.
 UNFORESEEN, MOST_UNFORESEEN = np.float32(0.09), np.float32(0.017)
+# Straight behind a surface it is solid for this long [m], though no view ended there; straight is what is within this
+# cosine of its normal.
+SOLID, STRAIGHT = np.float32(0.1), np.float32(0.7)
 
 
 class Patches(NamedTuple):
     """Discs that stand for the surface, and which is nearest where.
 
     Args:
-        centre: (n, 3) float32 [m].
-        normal: (n, 3) float32.
-        weight: (n,) float32, evidence of each.
-        radius: of all [m].
+        discs: (n, 8) float32, see `isdf.mapping.seeds.surface_seeds`.
+        widest: greatest of their radii [m].
         nearest: (nx, ny, nz) int32 index of the nearest of every second fine node of the window.
     """
 
-    centre: Float[np.ndarray, "n 3"]
-    normal: Float[np.ndarray, "n 3"]
-    weight: Float[np.ndarray, "n"]
-    radius: float
+    discs: Float[np.ndarray, "n 8"]
+    widest: float
     nearest: Int[np.ndarray, "nx ny nz"]
 
 
@@ -48,7 +47,10 @@ class Window(NamedTuple):
     Args:
         first: (3,) lattice index of its first node.
         ratio: fine steps between coarse nodes.
+        step: length of a fine step [m].
+        voxels: of the fused distances in a fine step.
         evidence: uint8, see `isdf.mapping.evidence`.
+        upper: float32, upper bounds [m].
         lower: float32, lower bounds [m].
         share: float32, guessed shares of the gap between the bounds.
         width: float32, logarithm of the expected error over the gap.
@@ -61,7 +63,10 @@ class Window(NamedTuple):
 
     first: np.ndarray
     ratio: int
+    step: float
+    voxels: int
     evidence: np.ndarray
+    upper: np.ndarray
     lower: np.ndarray
     share: np.ndarray
     width: np.ndarray
@@ -81,16 +86,14 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
         for j in range(shape[1]):
             for k in range(shape[2]):
                 at = (i * window.ratio, j * window.ratio, k * window.ratio)
-                upper, side, seed = nearest_patch(window, patches, bricks.voxel, at)
-                sign = fused_sign(window, bricks, at, side)
-                if sign == 0 and window.evidence[i, j, k] > FREE_ABOVE:
-                    sign = 1
+                upper, side, seed = nearest_patch(window, patches, at)
+                sign = side_of(window, bricks, at, upper, side, window.evidence[i, j, k])
                 low = min(window.lower[i, j, k], upper)
                 if sign < 0:
                     low = upper
                 elif sign > 0:
                     low = max(low, np.float32(0))
-                elif upper < SURFACE_REACH * window.ratio * bricks.voxel:
+                elif upper < SURFACE_REACH * window.ratio * window.step:
                     low = -upper
                 else:
                     low = max(min(low, np.float32(0)), -upper)
@@ -102,7 +105,7 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
                 window.taken[i, j, k] = 2 * upper if sign < 0 else gap * share
                 window.value[i, j, k] = upper - window.taken[i, j, k]
                 window.state[i, j, k] = sign
-                faint = FAINT_WEIGHT / (patches.weight[seed] + FAINT_WEIGHT)
+                faint = FAINT_WEIGHT / (patches.discs[seed, 6] + FAINT_WEIGHT)
                 odds = SEED_ODDS + FAINT_ODDS * faint
                 # The guess's error is Laplace distributed: its chance to be small, times that of the seed.
                 chance = (1 - np.exp(-LARGE_ERROR / max(error, np.float32(1e-3)))) / (1 + odds)
@@ -113,28 +116,47 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def fused_sign(window, bricks, at, side):
-    """Side of the seen surfaces a fine node lies on by the fused distances: 1, -1, or 0 where none was fused."""
-    distance, weight = voxel_at(
+def fused_at(window, bricks, at):
+    """Fused distance [m] and weight of a fine node."""
+    return voxel_at(
         bricks,
-        window.first[0] * window.ratio + at[0],
-        window.first[1] * window.ratio + at[1],
-        window.first[2] * window.ratio + at[2],
+        window.voxels * (window.first[0] * window.ratio + at[0]),
+        window.voxels * (window.first[1] * window.ratio + at[1]),
+        window.voxels * (window.first[2] * window.ratio + at[2]),
     )
-    if weight <= 0:
-        return 0
-    # Within half a voxel of the surface the patch knows better.
-    return 1 if (distance if abs(distance) > 0.5 * bricks.voxel else side) >= 0 else -1
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def nearest_patch(window, patches, voxel, at):
+def side_of(window, bricks, at, upper, height, seen):
+    """Side of the surfaces a fine node lies on: 1, -1, or 0 where it is not known.
+
+    Args:
+        window: where.
+        bricks: the fused distances.
+        at: the node.
+        upper: distance to the nearest patch [m].
+        height: above that patch [m].
+        seen: evidence that the node is free.
+    """
+    distance, weight = fused_at(window, bricks, at)
+    if weight > 0:
+        # Within half a voxel of the surface the patch knows better.
+        return 1 if (distance if abs(distance) > 0.5 * bricks.voxel else height) >= 0 else -1
+    # What is looked through so near to a surface is fused; the coarser evidence of free space may come from before it.
+    if upper < SOLID and height < -STRAIGHT * upper:
+        return -1
+    return 1 if seen > FREE_ABOVE else 0
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def nearest_patch(window, patches, at):
     """Distance [m] of a fine node to the closest of the patches that are nearest around it, height above it, number."""
-    x = voxel * (window.first[0] * window.ratio + at[0])
-    y = voxel * (window.first[1] * window.ratio + at[1])
-    z = voxel * (window.first[2] * window.ratio + at[2])
-    radius = np.float32(patches.radius)
+    x = window.step * (window.first[0] * window.ratio + at[0])
+    y = window.step * (window.first[1] * window.ratio + at[1])
+    z = window.step * (window.first[2] * window.ratio + at[2])
+    discs, widest = patches.discs, np.float32(patches.widest)
     best, side, number, last = np.float32(1e30), np.float32(1), 0, -1
     # No patch is nearer whose centre is farther than that [m^2].
     enough = np.float32(1e30)
@@ -145,16 +167,18 @@ def nearest_patch(window, patches, voxel, at):
                 if n == last:
                     continue
                 last = n
-                a = np.float32(x - patches.centre[n, 0])
-                b = np.float32(y - patches.centre[n, 1])
-                c = np.float32(z - patches.centre[n, 2])
+                a, b, c = (
+                    np.float32(x - discs[n, 0]),
+                    np.float32(y - discs[n, 1]),
+                    np.float32(z - discs[n, 2]),
+                )
                 away = a * a + b * b + c * c
                 if away > enough:
                     continue
-                height = a * patches.normal[n, 0] + b * patches.normal[n, 1] + c * patches.normal[n, 2]
+                height, radius = a * discs[n, 3] + b * discs[n, 4] + c * discs[n, 5], discs[n, 7]
                 across = max(np.float32(0), np.sqrt(max(np.float32(0), away - height * height)) - radius)
                 square = across * across + height * height
                 if square < best:
                     best, side, number = square, height, n
-                    enough = square + radius * (radius + np.float32(2) * np.sqrt(square))
+                    enough = square + widest * (widest + np.float32(2) * np.sqrt(square))
     return np.sqrt(best), side, number

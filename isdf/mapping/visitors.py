@@ -1,7 +1,7 @@
 """What comes into free space and is not seen to stay, such as somebody who walks by, is taken back out of the map.
 
 A camera sees where people were last before they left its view; as far as it knows they stand there for good. So every
-brick that something comes into is kept as it was, and given back when nothing was seen in it for a while. What stays in
+place that something comes into is kept as it was, and given back when nothing was seen in it for a while. What stays in
 view in one place is no visitor.
 
 A camera that looks ahead sees no more than the upper half of who stands close to it. Who comes into free space stands
@@ -10,21 +10,20 @@ on the floor: what was seen of him goes on down to it, where the image does not 
 
 from __future__ import annotations
 
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 from scipy.ndimage import binary_dilation
 
-from .bricks import SIDE, Bricks, BrickVolume
+from .bricks import SIDE, BrickVolume
 from .departed import looked_past
-from .evidence import FREE_ABOVE, INSIDE
 from .lately import Lately
-from .lattice import Lattice, LatticeArrays, node_at
-from .standing import columns, corners, extend_down, feet, vertical
+from .lattice import Lattice
+from .standing import columns, corners, extend_down, feet, parts, vertical
+from .visited import visited_places
 
-# Seen in one brick for longer than this [s], something has come to stay. Whoever walks is through in two, but may wait
+# Seen in one place for longer than this [s], something has come to stay. Whoever walks is through in two, but may wait
 # for a robot for a while.
 STAYS = 5.0
 # What has come to stay is still told from what always stood there for this long [s].
@@ -32,23 +31,23 @@ SETTLES = 10.0
 # What is nearer than this to the camera [m] is not taken back unless it has visibly gone: close to its own robot a
 # camera sees little.
 NEAR = 1.2
-# A visitor changes bricks from this far before its surface, the least truncation [m], up to `INSIDE` behind it.
-BEFORE = 0.1
-# Coarse nodes a side of a brick.
-NODES = 2
+# Coarse nodes, and bricks, a side of a place, the unit that is kept and given back.
+NODES = BRICKS = 2
+# Something came where distances are less than before by this much [m]; so many voxels a side are told apart.
+NEARER, CUBE = 0.02, 4
 
 
 class Kept(NamedTuple):
-    """Bricks as they were before something came.
+    """Places as they were before something came.
 
     Args:
-        place: (n, 3) lattice index of each.
+        place: (n, 3) index of each: the bricks of a place and their coarse nodes are those of its box.
         first: (n,) when something was seen in it first [s], inf if it only came near.
         last: (n,) when something was seen in it last, or when it was kept [s].
         past: (n,) when it was seen last that nobody stands in it, see `isdf.mapping.departed` [s], -inf if never.
-        distance: (n, 512) float32 [m].
-        weight: (n, 512) float32, 0 where nothing was observed.
-        ended: (n, 512) float32, see `isdf.mapping.bricks.Bricks`.
+        distance: (n, bricks, 512) float32 [m].
+        weight: (n, bricks, 512) float32, 0 where nothing was observed.
+        ended: (n, bricks, 512) float32, see `isdf.mapping.bricks.Bricks`.
         evidence: (n, 2, 2, 2) uint8 of its coarse nodes.
     """
 
@@ -75,12 +74,16 @@ class Visitors:
 
     Args:
         bricks: the surfaces.
-        lattice: the evidence of free space; two of its nodes a side lie in a brick.
+        lattice: the evidence of free space, its nodes as far apart as bricks are wide.
+        before: a visitor changes places from this far before its surface [m], up to `isdf.mapping.evidence.INSIDE` [m]
+            behind it.
         memory: how long something that is out of view stays in the map [s]; None: for ever.
     """
 
-    def __init__(self, bricks: BrickVolume, lattice: Lattice, memory: float | None) -> None:
-        self.bricks, self.lattice, self.memory = bricks, lattice, memory
+    def __init__(self, bricks: BrickVolume, lattice: Lattice, before: float, memory: float | None) -> None:
+        self.bricks, self.lattice, self.before, self.memory = bricks, lattice, before, memory
+        self.edge = NODES * lattice.spacing
+        self._offsets = np.argwhere(np.ones((BRICKS,) * 3, dtype=bool))
         self._kept = self._copied(np.empty((0, 3), dtype=np.int64), 0.0)
         self._feet = np.empty((0, 4), dtype=np.int64)
         self._settled = self._kept
@@ -112,23 +115,23 @@ class Visitors:
         if self.memory is None or not (appeared.any() or len(self._kept.place)):
             return
         table, inside = self._table(), self._in_lattice()
-        pixels = visited_bricks(
-            self.bricks.arrays, self.lattice.arrays, self.lattice.corner, table, self._kept.evidence, depth,
-            appeared, stride, intrinsics, T_world_camera,
+        pixels = visited_places(
+            self.edge, self._corner, self.before, self.lattice.arrays, self.lattice.corner, table,
+            self._kept.evidence, depth, appeared, stride, intrinsics, T_world_camera,
         )  # fmt: skip
         visited = pixels != 0
         axis, way = vertical(up)
-        ground = int(np.floor(floor / self._edge)) - int(self.bricks.corner[axis])
+        ground = int(np.floor(floor / self.edge)) - int(self._corner[axis])
         self._feet = feet(pixels, inside, axis, way, ground)
         visited[tuple(columns(self._feet, axis, way).T)] = True
         # Whoever walks on comes into the neighbours next, little by little: keep those, too.
         near = binary_dilation(visited, np.ones((3, 3, 3), dtype=bool)) & (table < 0) & inside
-        self._kept = self._kept.and_also(self._copied(np.argwhere(near) + self.bricks.corner, now))
+        self._kept = self._kept.and_also(self._copied(np.argwhere(near) + self._corner, now))
         rows = self._table()[visited & inside]
         self._kept.first[rows] = np.minimum(self._kept.first[rows], now)
         self._kept.last[rows] = now
         seen = np.isfinite(self._kept.first)
-        past = looked_past(self._kept.place, seen, self._edge, depth, intrinsics, T_world_camera, axis)
+        past = looked_past(self._kept.place, seen, self.edge, depth, intrinsics, T_world_camera, axis)
         self._kept.past[past] = now
 
     def stand(
@@ -146,13 +149,14 @@ class Visitors:
         if len(self._feet) == 0:
             return None
         axis, way = vertical(up)
-        under = np.unique(columns(self._feet, axis, way), axis=0)
+        highest = parts(self._feet, BRICKS, axis, way)
+        under = np.unique(columns(highest, axis, way), axis=0)
         self.bricks.add(under[self.bricks.table[tuple(under.T)] < 0])
-        extend_down(self.bricks.arrays, self._feet, axis, way, depth, intrinsics, T_camera_world)
-        return self._edge * (self.bricks.corner + corners(under))
+        extend_down(self.bricks.arrays, highest, BRICKS, axis, way, depth, intrinsics, T_camera_world)
+        return SIDE * self.bricks.voxel * (self.bricks.corner + corners(under))
 
     def take_back(self, eye: Float[np.ndarray, "3"], now: float) -> Float[np.ndarray, "2 3"] | None:
-        """Give back the bricks whose visitors have been out of view for long enough.
+        """Give back the places whose visitors have been out of view for long enough.
 
         Args:
             eye: where the camera is [m].
@@ -165,7 +169,7 @@ class Visitors:
         if self.memory is None or len(kept.place) + len(self._settled.place) == 0:
             return None
         stayed = kept.last - kept.first > STAYS
-        near = np.linalg.norm(self._edge * (kept.place + 0.5) - eye, axis=1) < NEAR
+        near = np.linalg.norm(self.edge * (kept.place + 0.5) - eye, axis=1) < NEAR
         hidden = near & (kept.past <= kept.last)
         gone = ~stayed & ~hidden & (now - kept.last > self.memory)
         self._kept = kept.of(~stayed & ~gone)
@@ -175,45 +179,64 @@ class Visitors:
         if len(back.place) == 0:
             return None
         self._give_back(back)
-        return self._edge * corners(back.place)
+        return self.edge * corners(back.place)
 
     def lately(self) -> Lately:
         """Where something came and, as far as the camera knows, still is."""
         kept = self._kept.of(np.isfinite(self._kept.first)).and_also(self._settled)
-        row = self.bricks.table[tuple((kept.place - self.bricks.corner).T)]
-        kept, row = kept.of(row >= 0), row[row >= 0]
-        there = self.bricks.weight[row] > 0
-        there &= _nearer(self.bricks.distance[row], kept.distance, kept.weight, self.bricks.voxel)
-        # Two voxels a side are one cube.
-        cubes = there.reshape(-1, *(SIDE // 2, 2) * 3).any(axis=(2, 4, 6))
-        brick, *inside = np.nonzero(cubes)
-        places = kept.place[brick] * (SIDE // 2) + np.stack(inside, axis=1)
-        return Lately.of(places, 2 * self.bricks.voxel)
+        row = self._rows(kept.place)
+        there = (row >= 0)[..., None] & (self.bricks.weight[row] > 0)
+        there &= self._nearer(self.bricks.distance[row], kept.distance, kept.weight)
+        # Some voxels a side are one cube.
+        side = SIDE // CUBE
+        cubes = there.reshape(*row.shape, *(side, CUBE) * 3).any(axis=(3, 5, 7))
+        place, brick, *inside = np.nonzero(cubes)
+        bricks = BRICKS * kept.place[place] + self._offsets[brick]
+        return Lately.of(side * bricks + np.stack(inside, axis=1), CUBE * self.bricks.voxel)
+
+    def _nearer(
+        self,
+        now: Float[np.ndarray, "*bricks 512"],
+        before: Float[np.ndarray, "*bricks 512"],
+        weight: Float[np.ndarray, "*bricks 512"],
+    ) -> Bool[np.ndarray, "*bricks 512"]:
+        """Where distances [m] are less than before; what had no `weight` was not known to be free."""
+        return np.where(weight > 0, now < before - NEARER, now < self.before)
 
     @property
-    def _edge(self) -> float:
-        """Of a brick [m]."""
-        return SIDE * self.bricks.voxel
+    def _corner(self) -> Int[np.ndarray, "3"]:
+        """Index of the first place; the table of bricks begins with a whole one, for it grows by blocks of four."""
+        return self.bricks.corner // BRICKS
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        """Places an axis."""
+        return tuple(n // BRICKS for n in self.bricks.table.shape)
+
+    def _rows(self, place: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n bricks"]:
+        """Numbers of the bricks of each place, -1 where none is stored."""
+        index = BRICKS * place[:, None] + self._offsets - self.bricks.corner
+        return self.bricks.table[tuple(np.moveaxis(index, -1, 0))]
 
     def _table(self) -> Int[np.ndarray, "nx ny nz"]:
-        """Row of every brick that is kept, -1 elsewhere; as large as the table of bricks, which never shrinks."""
-        table = np.full(self.bricks.table.shape, -1, dtype=np.int32)
-        table[tuple((self._kept.place - self.bricks.corner).T)] = np.arange(len(self._kept.place))
+        """Row of every place that is kept, -1 elsewhere; as large as the table of bricks, which never shrinks."""
+        table = np.full(self._shape, -1, dtype=np.int32)
+        table[tuple((self._kept.place - self._corner).T)] = np.arange(len(self._kept.place))
         return table
 
     def _in_lattice(self) -> Bool[np.ndarray, "nx ny nz"]:
-        """Which bricks of the table have their nodes in the lattice."""
-        first = self.lattice.corner // NODES - self.bricks.corner
-        inside = np.zeros(self.bricks.table.shape, dtype=bool)
-        parts = zip(first, first + np.array(self.lattice.shape) // NODES, strict=True)
-        inside[tuple(slice(max(0, a), max(0, b)) for a, b in parts)] = True
+        """Which places have their nodes in the lattice."""
+        first = self.lattice.corner // NODES - self._corner
+        inside = np.zeros(self._shape, dtype=bool)
+        slices = zip(first, first + np.array(self.lattice.shape) // NODES, strict=True)
+        inside[tuple(slice(max(0, a), max(0, b)) for a, b in slices)] = True
         return inside
 
     def _copied(self, place: Int[np.ndarray, "n 3"], now: float) -> Kept:
-        """Bricks as they are."""
+        """Places as they are."""
         count = len(place)
-        row = self.bricks.table[tuple((place - self.bricks.corner).T)] if count else np.empty(0, np.int32)
-        distance, weight, ended = (np.zeros((count, SIDE**3), dtype=np.float32) for _ in range(3))
+        row = self._rows(place) if count else np.empty((0, BRICKS**3), np.int32)
+        distance, weight, ended = (np.zeros((*row.shape, SIDE**3), dtype=np.float32) for _ in range(3))
         distance[row >= 0] = self.bricks.distance[row[row >= 0]]
         weight[row >= 0] = self.bricks.weight[row[row >= 0]]
         ended[row >= 0] = self.bricks.ended[row[row >= 0]]
@@ -227,7 +250,7 @@ class Visitors:
     def _evidence(
         self, place: Int[np.ndarray, "n 3"]
     ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-        """First node and evidence of a window that holds some bricks, and where in it their nodes are."""
+        """First node and evidence of a window that holds some places, and where in it their nodes are."""
         begin, end = NODES * place.min(axis=0), NODES * (place.max(axis=0) + 1)
         seen = self.lattice.read("evidence", begin - self.lattice.corner, end - self.lattice.corner)
         first, step = (NODES * place - begin)[:, :, None, None, None], np.indices((NODES,) * 3)
@@ -235,11 +258,11 @@ class Visitors:
 
     def _give_back(self, back: Kept) -> None:
         """Undo what brought surfaces nearer and made space less free; what was learnt of free space stays."""
-        row = self.bricks.table[tuple((back.place - self.bricks.corner).T)]
+        row = self._rows(back.place)
         there = row >= 0
         row, before, weight = row[there], back.distance[there], back.weight[there]
         now = self.bricks.distance[row]
-        nearer = _nearer(now, before, weight, self.bricks.voxel)
+        nearer = self._nearer(now, before, weight)
         self.bricks.distance[row] = np.where(nearer, before, now)
         self.bricks.weight[row] = np.where(nearer, weight, self.bricks.weight[row])
         self.bricks.ended[row] = np.where(nearer, back.ended[there], self.bricks.ended[row])
@@ -247,91 +270,3 @@ class Visitors:
         seen[nodes] = np.maximum(seen[nodes], back.evidence)
         begin = begin - self.lattice.corner
         self.lattice.write(begin, begin + seen.shape, evidence=seen)
-
-
-def _nearer(
-    now: Float[np.ndarray, "n 512"],
-    before: Float[np.ndarray, "n 512"],
-    weight: Float[np.ndarray, "n 512"],
-    voxel: float,
-) -> Bool[np.ndarray, "n 512"]:
-    """Where distances [m] are less than before, by half a voxel [m]; what had no `weight` was not known to be free."""
-    return np.where(weight > 0, now < before - 0.5 * voxel, now < BEFORE)
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def visited_bricks(
-    bricks: Bricks, lattice: LatticeArrays, first_node, kept, evidence, depth, appeared, stride, intrinsics, T_wc
-):  # fmt: skip
-    """How many pixels show something that has come in each brick of the table; -1 where it only hides what is there.
-
-    Args:
-        bricks: before the image is fused.
-        lattice: likewise.
-        first_node: (3,) lattice index of its first node.
-        kept: (nx, ny, nz) row of every brick that is kept, -1 elsewhere.
-        evidence: (n, 2, 2, 2) of the nodes of those.
-        depth, appeared, stride, intrinsics, T_wc: see `Visitors.watch`.
-    """
-    fx, fy, cx, cy = intrinsics
-    R, t = T_wc[:3, :3], T_wc[:3, 3]
-    table, corner, edge = bricks.table, bricks.corner, SIDE * bricks.voxel
-    out = np.zeros(table.shape, dtype=np.int32)
-    ray, point, index = np.empty(3), np.empty(3), np.empty(3, np.int64)
-    steps = int(np.ceil((BEFORE + INSIDE) / (0.5 * edge)))
-    for row in range(appeared.shape[0]):
-        for column in range(appeared.shape[1]):
-            v, u = row * stride, column * stride
-            z = depth[v, u]
-            if z <= 0:
-                continue
-            a, b = (u - cx) / fx, (v - cy) / fy
-            inside = True
-            for axis in range(3):
-                ray[axis] = R[axis, 0] * a + R[axis, 1] * b + R[axis, 2]
-                point[axis] = t[axis] + z * ray[axis]
-                index[axis] = int(np.floor(point[axis] / edge)) - corner[axis]
-                inside &= 0 <= index[axis] < table.shape[axis]
-            if not inside:
-                continue
-            if not appeared[row, column]:
-                known = kept[index[0], index[1], index[2]] >= 0
-                if not known or not _was_free(lattice, first_node, kept, corner, evidence, point):
-                    continue
-            out[index[0], index[1], index[2]] = max(out[index[0], index[1], index[2]], 0) + 1
-            for n in range(steps + 1):
-                w = z - BEFORE + (BEFORE + INSIDE) * n / steps
-                inside = True
-                for axis in range(3):
-                    index[axis] = int(np.floor((t[axis] + w * ray[axis]) / edge)) - corner[axis]
-                    inside &= 0 <= index[axis] < table.shape[axis]
-                if inside and out[index[0], index[1], index[2]] == 0:
-                    out[index[0], index[1], index[2]] = -1
-    return out
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _was_free(lattice, first_node, kept, corner, evidence, point):
-    """Whether all nodes round a point were seen to be free before anything came."""
-    shape = lattice.table.shape
-    n = np.floor(point / lattice.spacing).astype(np.int64)
-    for corner_of_cell in range(8):
-        i = n[0] + (corner_of_cell >> 2)
-        j = n[1] + ((corner_of_cell >> 1) & 1)
-        k = n[2] + (corner_of_cell & 1)
-        a, b, c = (i >> 1) - corner[0], (j >> 1) - corner[1], (k >> 1) - corner[2]
-        row = -1
-        if 0 <= a < kept.shape[0] and 0 <= b < kept.shape[1] and 0 <= c < kept.shape[2]:
-            row = kept[a, b, c]
-        if row >= 0:
-            free = evidence[row, i & 1, j & 1, k & 1] > FREE_ABOVE
-        else:
-            x, y, z = i - first_node[0], j - first_node[1], k - first_node[2]
-            if x < 0 or y < 0 or z < 0 or x >= 8 * shape[0] or y >= 8 * shape[1] or z >= 8 * shape[2]:
-                return False
-            free = node_at(lattice.table, lattice.evidence, x, y, z, 0) > FREE_ABOVE
-        if not free:
-            return False
-    return True

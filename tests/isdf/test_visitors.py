@@ -87,7 +87,7 @@ def test_furniture_beside_somebody_who_came_has_not_come():
     surface = before.distance(points).abs() < 0.02
     beside = surface & (room.abs() < 0.03) & (person_there > 0.15) & (person_there < 0.8)
     assert beside.sum() > 50
-    assert during.came(points[beside]).float().mean() < 0.1
+    assert during.came(points[beside]).float().mean() < 0.2
 
 
 def test_a_map_that_never_forgets_keeps_it():
@@ -157,23 +157,23 @@ def test_memories_that_are_none_are_refused(memory):
 
 
 @pytest.mark.parametrize("first", [0.0, math.inf])
-def test_only_bricks_that_something_came_into_are_given_back(first):
-    bricks, lattice = BrickVolume(0.04, 100_000), Lattice(0.16)
+def test_only_places_that_something_came_into_are_given_back(first):
+    bricks, lattice = BrickVolume(0.02, 100_000), Lattice(0.16)
     for volume in (bricks, lattice):
         volume.include(np.zeros(3), np.ones(3))
     place = np.array([[1, 1, 1]])
-    bricks.add(place - bricks.corner)
-    visitors = Visitors(bricks, lattice, memory=2.0)
+    bricks.add(2 * place + np.argwhere(np.ones((2, 2, 2))) - bricks.corner)
+    visitors = Visitors(bricks, lattice, before=0.06, memory=2.0)
     visitors._kept = visitors._copied(place, 1.0)._replace(first=np.array([first]))
-    bricks.weight[0], bricks.distance[0] = 1.0, 0.02  # a surface
+    bricks.weight[:], bricks.distance[:] = 1.0, 0.02  # a surface
     box = visitors.take_back(np.array([9.0, 0.0, 0.0]), 2.9)
     assert box is None, "not yet"
     box = visitors.take_back(np.array([9.0, 0.0, 0.0]), 3.1)
     if math.isinf(first):
-        assert box is None and (bricks.weight[0] == 1).all()
+        assert box is None and (bricks.weight == 1).all()
     else:
         np.testing.assert_allclose(box, [[0.32] * 3, [0.64] * 3])
-        assert (bricks.weight[0] == 0).all()
+        assert (bricks.weight == 0).all()
 
 
 def test_what_belongs_to_something_that_came_may_lie_a_little_beside_its_bricks():

@@ -151,7 +151,7 @@ def test_what_does_not_fit_is_named() -> None:
         RefineConfig(base_joints=("base_x",))
     with pytest.raises(ConfigError, match="fewest <= most"):
         RefineConfig(fewest=50, most=40)
-    with pytest.raises(ConfigError, match="must not be negative"):
+    with pytest.raises(ConfigError, match="margin must be a number"):
         RefineConfig(margin=math.nan)
     with pytest.raises(TrajectoryError, match="2 joints a waypoint"):
         Refiner(Base(), ACCELERATIONS).refine(Trajectory.line(torch.zeros(2), torch.ones(2)), FREE)
