@@ -35,9 +35,7 @@ def nearest_around(depth: Float[np.ndarray, "h w"], focal: float) -> Float[np.nd
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def fuse(
-    bricks: Bricks, begin, end, depth, around, hides, noise, least, max_weight, intrinsics, T_camera_world
-):
+def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, intrinsics, T_camera_world):
     """Average one depth image into the stored voxels of a box of bricks, in place.
 
     Args:
@@ -46,7 +44,6 @@ def fuse(
         end: (3,) one past its last.
         depth: (h, w) float32 z-depth [m], 0 = unknown.
         around: (h, w) float32, `nearest_around` of it.
-        hides: (h, w) float32: this far behind what was measured [m] nothing is free any more, for it has just come.
         noise: truncation per squared depth.
         least: least truncation [m].
         max_weight: limit of a voxel's weight.
@@ -59,7 +56,7 @@ def fuse(
         np.array((noise, least, max_weight, voxel), dtype=np.float32),
         np.empty(3, dtype=np.float32),
     )
-    deepest, behind = _deepest(depth), hides.max()
+    deepest, flat, flat_around = _deepest(depth), depth.ravel(), around.ravel()
     pixels, z = np.empty(VOXELS, dtype=np.int32), np.empty(VOXELS, dtype=np.float32)
     for bi in range(begin[0], end[0]):
         for bj in range(begin[1], end[1]):
@@ -70,12 +67,11 @@ def fuse(
                 first[0] = voxel * SIDE * (corner[0] + bi)
                 first[1] = voxel * SIDE * (corner[1] + bj)
                 first[2] = voxel * SIDE * (corner[2] + bk)
-                if _may_change(first, bands, deepest, behind, depth.shape, K, T):
+                if _may_change(first, bands, deepest, depth.shape, K, T):
                     _project(first, bands[3], depth.shape, K, T, pixels, z)
                     _average(
-                        distances[brick], weights[brick], ended[brick], pixels, z, depth.ravel(), around.ravel(),
-                        hides.ravel(), bands,
-                    )  # fmt: skip
+                        distances[brick], weights[brick], ended[brick], pixels, z, flat, flat_around, bands
+                    )
 
 
 @njit(cache=True, nogil=True)
@@ -92,7 +88,7 @@ def _deepest(depth):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _may_change(first, bands, deepest, behind, shape, K, T):
+def _may_change(first, bands, deepest, shape, K, T):
     """Whether the ball about a brick is in view and not wholly hidden: (3,) `first` is its first voxel [m]."""
     noise, least, voxel = bands[0], bands[1], bands[3]
     half = np.float32(0.5 * (SIDE - 1)) * voxel
@@ -117,7 +113,7 @@ def _may_change(first, bands, deepest, behind, shape, K, T):
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
             far = deepest[v, u]
-            if far > 0 and near < far + max(least, noise * far * far, behind):
+            if far > 0 and near < far + max(least, noise * far * far):
                 return True
     return False
 
@@ -149,7 +145,7 @@ def _project(first, voxel, shape, K, T, pixels, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _average(distances, weights, ended, pixels, z, depth, around, hides, bands):
+def _average(distances, weights, ended, pixels, z, depth, around, bands):
     """Average what an image measures into the voxels (512,) of a brick."""
     noise, least, max_weight, voxel = bands
     floor, one = np.float32(NOISE_FLOOR_DEPTH), np.float32(1)
@@ -163,9 +159,6 @@ def _average(distances, weights, ended, pixels, z, depth, around, hides, bands):
         band = max(least, noise * measured * measured)
         ahead = measured - z[at]
         if ahead <= -band:
-            # What was free here is hidden in something that has come; surfaces may still be there behind it.
-            if ahead > -hides[pixel] and distances[at] > np.float32(0.75) * least:
-                weights[at] = 0
             continue
         far = max(measured, floor)
         # Behind a surface less and less is known; what is there may be seen from its other side.

@@ -25,7 +25,7 @@ from .agreement import compare
 from .bricks import BrickVolume, missing_bricks
 from .completion import load_network
 from .config import MapperConfig
-from .evidence import INSIDE, look_through
+from .evidence import look_through
 from .field import LatticeField
 from .footprint import clear
 from .fusion import fuse, nearest_around
@@ -304,13 +304,7 @@ class Mapper(ShownMapper):
         bricks.add(missing_bricks(bricks.arrays, depth, sparse, *band, intrinsics, T))
         inverse = np.linalg.inv(T)
         around = nearest_around(depth, frame.camera.fx)
-        height, width = depth.shape
-        hides = (
-            np.float32(INSIDE) * appeared.repeat(stride, axis=0)[:height].repeat(stride, axis=1)[:, :width]
-        )
-        fuse(
-            bricks.arrays, *bricks.box(*box), depth, around, hides, *band, config.max_weight, intrinsics, inverse
-        )  # fmt: skip
+        fuse(bricks.arrays, *bricks.box(*box), depth, around, *band, config.max_weight, intrinsics, inverse)
         begin, end = lattice.window(*box)
         evidence = lattice.read("evidence", begin, end)
         first, size = lattice.corner + begin, end - begin

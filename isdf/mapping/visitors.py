@@ -20,6 +20,7 @@ from .bricks import SIDE, BrickVolume
 from .departed import looked_past
 from .lately import Lately
 from .lattice import Lattice
+from .seeds import ENDED
 from .standing import columns, corners, extend_down, feet, parts, vertical
 from .visited import visited_places
 
@@ -185,7 +186,7 @@ class Visitors:
         """Where something came and, as far as the camera knows, still is."""
         kept = self._kept.of(np.isfinite(self._kept.first)).and_also(self._settled)
         row = self._rows(kept.place)
-        there = (row >= 0)[..., None] & (self.bricks.weight[row] > 0)
+        there = (row >= 0)[..., None] & (self.bricks.weight[row] > 0) & (self.bricks.ended[row] >= ENDED)
         there &= self._nearer(self.bricks.distance[row], kept.distance, kept.weight)
         # Some voxels a side are one cube.
         side = SIDE // CUBE

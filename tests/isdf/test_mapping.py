@@ -379,7 +379,7 @@ def fused_wall():
     pose[2, 3] = 1.0
     intrinsics = (80.0, 80.0, 39.5, 29.5)
     shape = np.array(bricks.table.shape)
-    fuse(bricks.arrays, 0 * shape, shape, depth, depth, 0 * depth, 0.012, 0.1, 20.0, intrinsics, pose)
+    fuse(bricks.arrays, 0 * shape, shape, depth, depth, 0.012, 0.1, 20.0, intrinsics, pose)
     return bricks
 
 
@@ -443,7 +443,7 @@ def test_fusing_is_what_every_voxel_by_itself_would_be_given():
     depth[rng.random(depth.shape) < 0.2] = 0
     intrinsics = (70.0, 60.0, 41.0, 27.0)
     inverse = np.linalg.inv(look_at(torch.tensor([0.9, -0.8, 0.3]), torch.zeros(3)))
-    fuse(bricks.arrays, 0 * shape, shape, depth, depth, 0 * depth, 0.012, 0.06, 20.0, intrinsics, inverse)
+    fuse(bricks.arrays, 0 * shape, shape, depth, depth, 0.012, 0.06, 20.0, intrinsics, inverse)
     for place in np.argwhere(bricks.table >= 0):
         voxels = 8 * (bricks.corner + place) + np.argwhere(np.ones((8, 8, 8)))
         x, y, z = inverse[:3, :3] @ (0.02 * voxels.T) + inverse[:3, 3:]

@@ -87,7 +87,7 @@ def test_furniture_beside_somebody_who_came_has_not_come():
     surface = before.distance(points).abs() < 0.02
     beside = surface & (room.abs() < 0.03) & (person_there > 0.15) & (person_there < 0.8)
     assert beside.sum() > 50
-    assert during.came(points[beside]).float().mean() < 0.2
+    assert during.came(points[beside]).float().mean() < 0.1
 
 
 def test_a_map_that_never_forgets_keeps_it():
