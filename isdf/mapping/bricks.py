@@ -10,6 +10,7 @@ from numba import njit
 
 from ..errors import FrameError
 from ..extent import fits
+from .seed_store import SeedStore
 
 SIDE = 8
 VOXELS = SIDE**3
@@ -27,6 +28,7 @@ class Bricks(NamedTuple):
         weight: (bricks, 512) float32.
         ended: (bricks, 512) float32, share of the views, by weight, that ended within a voxel of it.
         voxel: edge of a voxel [m].
+        changes: (bricks,) int64, how often each has changed; whoever changes one counts it here.
     """
 
     table: np.ndarray
@@ -35,6 +37,7 @@ class Bricks(NamedTuple):
     weight: np.ndarray
     ended: np.ndarray
     voxel: float
+    changes: np.ndarray
 
 
 class BrickVolume:
@@ -55,6 +58,8 @@ class BrickVolume:
         self._distance = np.zeros((256, VOXELS), dtype=np.float32)
         self._weight = np.zeros((256, VOXELS), dtype=np.float32)
         self._ended = np.zeros((256, VOXELS), dtype=np.float32)
+        self._changes = np.zeros(256, dtype=np.int64)
+        self.seeds = SeedStore()
 
     @property
     def distance(self) -> Float[np.ndarray, "bricks 512"]:
@@ -73,8 +78,14 @@ class BrickVolume:
 
     @property
     def arrays(self) -> Bricks:
-        """For compiled code, which may change the distances and weights in place."""
-        return Bricks(self.table, self.corner, self._distance, self._weight, self._ended, self.voxel)
+        """For compiled code, which may change the distances and weights in place, and counts that in `changes`."""
+        return Bricks(
+            self.table, self.corner, self._distance, self._weight, self._ended, self.voxel, self._changes
+        )
+
+    def changed(self, rows: Int[np.ndarray, "n"]) -> None:
+        """Call after writing to `distance`, `weight` or `ended` of these bricks: surfaces are found anew in them."""
+        self._changes[rows] += 1
 
     def box(
         self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]
@@ -87,7 +98,7 @@ class BrickVolume:
 
     @property
     def nbytes(self) -> int:
-        """Memory in use [bytes]."""
+        """Memory in use [bytes], without the seeds, which can be found again."""
         return self.table.nbytes + self.distance.nbytes + self.weight.nbytes + self.ended.nbytes
 
     def include(self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]) -> None:
@@ -122,6 +133,7 @@ class BrickVolume:
             self._distance = np.concatenate([self._distance, more])
             self._weight = np.concatenate([self._weight, more])
             self._ended = np.concatenate([self._ended, more])
+            self._changes = np.concatenate([self._changes, np.zeros(len(more), dtype=np.int64)])
         self.table[tuple(places.T)] = np.arange(self.count, self.count + len(places))
         self.count += len(places)
 
@@ -145,6 +157,7 @@ class BrickVolume:
         self.table, self.count = table.astype(np.int32), len(distance)
         self._distance, self._weight = distance.astype(np.float32), weight.astype(np.float32)
         self._ended = ended.astype(np.float32)
+        self._changes, self.seeds = np.zeros(self.count, dtype=np.int64), SeedStore()
 
 
 def moved(

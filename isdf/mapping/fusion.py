@@ -39,7 +39,7 @@ def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, in
     """Average one depth image into the stored voxels of a box of bricks, in place.
 
     Args:
-        bricks: changed.
+        bricks: changed, and counted where anything is.
         begin: (3,) first brick of the box, as array index.
         end: (3,) one past its last.
         depth: (h, w) float32 z-depth [m], 0 = unknown.
@@ -50,7 +50,7 @@ def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, in
         intrinsics: fx, fy, cx, cy.
         T_camera_world: (4, 4).
     """
-    table, corner, distances, weights, ended, voxel = bricks
+    table, corner, distances, weights, ended, voxel, changes = bricks
     K, T = np.array(intrinsics, dtype=np.float32), T_camera_world.astype(np.float32)
     bands, first = (
         np.array((noise, least, max_weight, voxel), dtype=np.float32),
@@ -69,7 +69,7 @@ def fuse(bricks: Bricks, begin, end, depth, around, noise, least, max_weight, in
                 first[2] = voxel * SIDE * (corner[2] + bk)
                 if _may_change(first, bands, deepest, depth.shape, K, T):
                     _project(first, bands[3], depth.shape, K, T, pixels, z)
-                    _average(
+                    changes[brick] += _average(
                         distances[brick], weights[brick], ended[brick], pixels, z, flat, flat_around, bands
                     )
 
@@ -146,8 +146,9 @@ def _project(first, voxel, shape, K, T, pixels, z):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _average(distances, weights, ended, pixels, z, depth, around, bands):
-    """Average what an image measures into the voxels (512,) of a brick."""
+    """Average what an image measures into the voxels (512,) of a brick; returns whether that is anything."""
     noise, least, max_weight, voxel = bands
+    some = False
     floor, one = np.float32(NOISE_FLOOR_DEPTH), np.float32(1)
     for at in range(VOXELS):
         pixel = pixels[at]
@@ -174,3 +175,5 @@ def _average(distances, weights, ended, pixels, z, depth, around, bands):
         weights[at] = min(total, max_weight)
         kind = one if abs(ahead) <= voxel else np.float32(0)
         ended[at] += (kind - ended[at]) * share
+        some = True
+    return some

@@ -15,7 +15,7 @@ from .evidence import Evidence, bounds, gather
 from .lattice import FINE, Lattice
 from .nearest import finer_nearest
 from .refinement import cells_to_refine, middle_values, near_known, refined_values
-from .seeds import surface_seeds
+from .seeds import kept_seeds
 from .values import Patches, Window, coarse_values
 
 # Surfaces this far outside a window still count in it [m].
@@ -66,7 +66,7 @@ def surroundings(
     spare = (end - begin) % STRIDE
     below = np.where((np.arange(3) == vertical) & upside_down, spare, 0)
     begin, end = begin + below, end - (spare - below)
-    seeds = surface_seeds(bricks.arrays, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))[:, :3]
+    seeds = kept_seeds(bricks, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))[:, :3]
     if len(seeds) == 0 or (end <= begin).any():
         return None
     order = [axis for axis in range(3) if axis != vertical] + [vertical]
@@ -121,7 +121,7 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     """Write the distances and confidences in a box [m] anew; False while there is no surface to measure from."""
     begin, end = lattice.window(box[0], box[1])
     low, high = (lattice.spacing * (lattice.corner + n) for n in (begin, end))
-    seeds = surface_seeds(bricks.arrays, *bricks.box(low - MARGIN, high + MARGIN))
+    seeds = kept_seeds(bricks, *bricks.box(low - MARGIN, high + MARGIN))
     if len(seeds) == 0:
         return False
     centre = seeds[:, :3]

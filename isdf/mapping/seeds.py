@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import no_type_check
 
 import numpy as np
+from jaxtyping import Float, Int
 from numba import njit
 
-from .bricks import SIDE, VOXELS, Bricks
+from .bricks import SIDE, VOXELS, Bricks, BrickVolume
 
 # Where space hidden behind the edge of a thing borders on space that another view looks through the distances cross
 # zero, too, but no view ends there. With less evidence of a surface than that it is none.
@@ -18,6 +19,16 @@ PATCH = 0.5
 # the plane than this [voxels]: flat surfaces are averaged, edges and thin boards stay sharp.
 BLOCK = 2
 FLAT, OFF = 0.95, 0.4
+
+
+def kept_seeds(
+    volume: BrickVolume, begin: Int[np.ndarray, "3"], end: Int[np.ndarray, "3"]
+) -> Float[np.ndarray, "n 8"]:
+    """The same as `surface_seeds`, but bricks that have not changed since the last time are not looked at again."""
+    store = volume.seeds
+    store.fit(volume.count)
+    store.put(*_changed_seeds(volume.arrays, begin, end, store.state))
+    return _gathered(volume.table, begin, end, store.first, store.number, store.seeds)
 
 
 @njit(cache=True, nogil=True)
@@ -34,39 +45,100 @@ def surface_seeds(bricks: Bricks, begin, end):
         float32 (n, 8): position [m], unit normal towards where each surface was seen from, weight, and radius [m] of
         the disc that stands for it.
     """
-    table, corner, distances, weights, ended, voxel = bricks
+    return _changed_seeds(bricks, begin, end, np.full(len(bricks.distance), -1))[3]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _changed_seeds(bricks, begin, end, state):
+    """Find the seeds of the bricks of a box whose `_state` is another than `state` (bricks,).
+
+    Returns:
+        Row, state now, and number of seeds (m,) of each of these bricks, and their seeds (n, 8) in that order.
+    """
+    table, corner, distances, weights, ended, voxel, _ = bricks
     # Farther from zero than this no neighbour is across, for distances that change by at most a voxel a voxel or so.
     limit = np.float32(1.8 * voxel)
-    size, count = 4096, 0
-    out = np.empty((size, 8), np.float32)
+    size, count, changed = 4096, 0, 0
+    out, rows = np.empty((size, 8), np.float32), np.empty((3, len(distances)), np.int64)
     near, few = np.empty((SIDE + 2, SIDE + 2, SIDE + 2), np.float32), np.empty((BLOCK**3, 7), np.float32)
     for bi in range(begin[0], end[0]):
         for bj in range(begin[1], end[1]):
             for bk in range(begin[2], end[2]):
                 brick = table[bi, bj, bk]
-                if brick < 0 or not _may_have(distances[brick], ended[brick], limit):
+                if brick < 0:
                     continue
-                if count + VOXELS > size:
-                    out = np.concatenate((out, np.empty_like(out)))
-                    size *= 2
-                _with_rim(bricks, bi, bj, bk, near)
-                first = (SIDE * (corner[0] + bi), SIDE * (corner[1] + bj), SIDE * (corner[2] + bk))
-                for i in range(0, SIDE, BLOCK):
-                    for j in range(0, SIDE, BLOCK):
-                        for k in range(0, SIDE, BLOCK):
-                            found = _crossings(
-                                near, weights[brick], ended[brick], voxel, limit, first, i, j, k, few
-                            )
-                            if found > 0:
-                                count = _patches(few[:found], voxel, out, count)
-    return out[:count].copy()
+                now = _state(table, bricks.changes, bi, bj, bk)
+                if now == state[brick]:
+                    continue
+                before = count
+                if _may_have(distances[brick], ended[brick], limit):
+                    if count + VOXELS > size:
+                        out = np.concatenate((out, np.empty_like(out)))
+                        size *= 2
+                    _with_rim(bricks, bi, bj, bk, near)
+                    first = (SIDE * (corner[0] + bi), SIDE * (corner[1] + bj), SIDE * (corner[2] + bk))
+                    seen = (weights[brick], ended[brick])
+                    count = _of_brick(near, *seen, voxel, limit, first, few, out, count)
+                rows[0, changed], rows[1, changed], rows[2, changed] = brick, now, count - before
+                changed += 1
+    return rows[0, :changed].copy(), rows[1, :changed].copy(), rows[2, :changed].copy(), out[:count].copy()
+
+
+@njit(cache=True, nogil=True, inline="always")
+@no_type_check
+def _state(table, changes, i, j, k):
+    """What the seeds of the brick at an array index depend on: how often it and those beside its faces have changed."""
+    total = changes[table[i, j, k]]
+    for side in (-1, 1):
+        x, y, z = _brick(table, i + side, j, k), _brick(table, i, j + side, k), _brick(table, i, j, k + side)
+        total += changes[x] if x >= 0 else 0
+        total += changes[y] if y >= 0 else 0
+        total += changes[z] if z >= 0 else 0
+    return total
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _gathered(table, begin, end, first, number, seeds):
+    """The seeds (n, 8) of the bricks of a box, in its order, from where each brick's are kept."""
+    count = 0
+    for bi in range(begin[0], end[0]):
+        for bj in range(begin[1], end[1]):
+            for bk in range(begin[2], end[2]):
+                if table[bi, bj, bk] >= 0:
+                    count += number[table[bi, bj, bk]]
+    out, at = np.empty((count, 8), np.float32), 0
+    for bi in range(begin[0], end[0]):
+        for bj in range(begin[1], end[1]):
+            for bk in range(begin[2], end[2]):
+                brick = table[bi, bj, bk]
+                if brick >= 0:
+                    for n in range(first[brick], first[brick] + number[brick]):
+                        for a in range(8):
+                            out[at, a] = seeds[n, a]
+                        at += 1
+    return out
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _of_brick(near, weights, ended, voxel, limit, first, few, out, count):
+    """Append the seeds of a brick whose first voxel has the lattice index `first`; returns how many there are."""
+    for i in range(0, SIDE, BLOCK):
+        for j in range(0, SIDE, BLOCK):
+            for k in range(0, SIDE, BLOCK):
+                found = _crossings(near, weights, ended, voxel, limit, first, i, j, k, few)
+                if found > 0:
+                    count = _patches(few[:found], voxel, out, count)
+    return count
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _with_rim(bricks, bi, bj, bk, out):
     """Write the distances (10, 10, 10) of a brick and of the voxels beside its faces, NaN where none was observed."""
-    table, _, distances, weights, _, _ = bricks
+    table, distances, weights = bricks.table, bricks.distance, bricks.weight
     brick, nan = table[bi, bj, bk], np.float32(np.nan)
     for i in range(SIDE):
         for j in range(SIDE):

@@ -83,7 +83,7 @@ def extend_down(bricks: Bricks, feet, own, axis, way, depth, intrinsics, T_camer
     """Go on downwards with the lowest distances of some bricks, but where the image looks.
 
     Args:
-        bricks: changed; all that is below is stored.
+        bricks: changed and counted; all that is below is stored.
         feet: (n, 4) array index of each of the bricks and how many bricks to go down.
         own: so many bricks from there on downwards have been seen themselves.
         axis: the vertical.
@@ -94,7 +94,7 @@ def extend_down(bricks: Bricks, feet, own, axis, way, depth, intrinsics, T_camer
     """
     fx, fy, cx, cy = intrinsics
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-    table, corner, distances, weights, ended, voxel = bricks
+    table, corner, distances, weights, ended, voxel, changes = bricks
     across = np.array([1, 2]) if axis == 0 else (np.array([0, 2]) if axis == 1 else np.array([0, 1]))
     brick, local, point = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3)
     for n in range(feet.shape[0]):
@@ -128,3 +128,4 @@ def extend_down(bricks: Bricks, feet, own, axis, way, depth, intrinsics, T_camer
                             continue
                     if weights[row, at] <= 0 or distances[row, at] > value:
                         distances[row, at], weights[row, at], ended[row, at] = value, weight, end
+                        changes[row] += 1

@@ -267,6 +267,7 @@ class Visitors:
         self.bricks.distance[row] = np.where(nearer, before, now)
         self.bricks.weight[row] = np.where(nearer, weight, self.bricks.weight[row])
         self.bricks.ended[row] = np.where(nearer, back.ended[there], self.bricks.ended[row])
+        self.bricks.changed(row)
         begin, seen, nodes = self._evidence(back.place)
         seen[nodes] = np.maximum(seen[nodes], back.evidence)
         begin = begin - self.lattice.corner
