@@ -171,7 +171,7 @@ def moved(
     return new
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[np.float32, np.float32]:
     """Distance [m] and weight of the voxel at a lattice index; 0 and 0 where nothing is stored."""

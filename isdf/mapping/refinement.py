@@ -140,7 +140,7 @@ def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corr
             corrections[number, m] = int(np.floor(steps + np.float32(0.5)))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _fine_value(upper, sign, seen, free, taken_free, taken_other):
     """Distance [m] of a fine node.
@@ -161,7 +161,7 @@ def _fine_value(upper, sign, seen, free, taken_free, taken_other):
     return upper - min(upper + upper, taken_other / (1 - free) if free < 1 else taken_free)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _of_corner(window, i, j, k):
     """What is interpolated of a node: value, evidence, free or not, and what a free and another node takes off."""
@@ -171,7 +171,7 @@ def _of_corner(window, i, j, k):
     return value, seen, np.float32(0), np.float32(0), taken
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _mean_of_corners(window, i, j, k):
     """Interpolation of all that `_of_corner` gives at a node of half the spacing."""

@@ -114,7 +114,7 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
                 window.confidence[i, j, k] = int(255 * chance + 0.5)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def fused_at(window, bricks, at):
     """Fused distance [m] and weight of a fine node."""
@@ -126,7 +126,7 @@ def fused_at(window, bricks, at):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def side_of(window, bricks, at, upper, height, seen):
     """Side of the surfaces a fine node lies on: 1, -1, or 0 where it is not known.
@@ -149,7 +149,7 @@ def side_of(window, bricks, at, upper, height, seen):
     return 1 if seen > FREE_ABOVE else 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def nearest_patch(window, patches, at):
     """Distance [m] of a fine node to the closest of the patches that are nearest around it, height above it, number."""
