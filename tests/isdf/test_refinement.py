@@ -50,6 +50,43 @@ def wavy(seed, count=3000):
     return points, away, away < 6
 
 
+def swept(points, where):
+    """Numbers of the nearest points of nodes, one node and one neighbour after the other."""
+    number, square = np.full(where.shape, -1), np.full(where.shape, np.inf, dtype=np.float32)
+
+    def offer(n, node):
+        away = points[n] - np.array(node, dtype=np.float32)
+        d = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
+        if d < square[node]:
+            number[node], square[node] = n, d
+
+    last = np.array(where.shape) - 1
+    for n, point in enumerate(np.floor(points).astype(int)):
+        for node in {tuple(np.clip(point + step, 0, last)) for step in np.ndindex(2, 2, 2)}:
+            offer(n, node)
+    before = [step for step in np.ndindex(3, 3, 3) if step < (1, 1, 1)]
+    nodes = [node for node in np.ndindex(*where.shape) if where[node]]
+    for order, way in ((nodes, 1), (nodes[::-1], -1)):
+        for node in order:
+            for step in before:
+                other = tuple(np.array(node) + way * (np.array(step) - 1))
+                if min(other) >= 0 and (np.array(other) <= last).all() and number[other] >= 0:
+                    offer(number[other], node)
+    return number, square
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_rows_swept_at_once_give_what_nodes_one_after_the_other_give(seed):
+    rng = np.random.default_rng(seed)
+    shape = np.array([5, 7, 12])
+    where = rng.random(shape) < (0.1, 0.3, 0.5, 0.8, 0.95, 1.0)[seed]
+    points = (rng.random((8, 3)) * (shape + 3) - 2).astype(np.float32)
+    number, square = nearest_points(points, where)
+    expected, least = swept(points, where)
+    assert np.array_equal(number, expected)
+    assert np.array_equal(square[number >= 0], least[number >= 0])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_mask_changes_nothing_of_what_is_asked_for(seed):
     points, away, where = wavy(seed)
