@@ -165,20 +165,13 @@ def _lower(free: np.ndarray, unknown: np.ndarray, upper: np.ndarray) -> np.ndarr
     return np.minimum(lower, upper)
 
 
-@njit(cache=True, nogil=True)
-@no_type_check
-def _beside(these, those):
+def _beside(these: np.ndarray, those: np.ndarray) -> np.ndarray:
     """Which of these nodes have one of those among their 26 neighbours."""
-    nx, ny, nz = these.shape
-    out = np.zeros(these.shape, dtype=np.bool_)
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                if not these[i, j, k]:
-                    continue
-                for a in range(max(0, i - 1), min(nx, i + 2)):
-                    for b in range(max(0, j - 1), min(ny, j + 2)):
-                        for c in range(max(0, k - 1), min(nz, k + 2)):
-                            if those[a, b, c]:
-                                out[i, j, k] = True
-    return out
+    grown = those
+    for axis in range(3):
+        lines = np.moveaxis(grown, axis, 0)
+        wider = lines.copy()
+        wider[1:] |= lines[:-1]
+        wider[:-1] |= lines[1:]
+        grown = np.moveaxis(wider, 0, axis)
+    return these & grown
