@@ -147,7 +147,7 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     where = near_known(window, bricks.arrays)
     places = (centre / np.float32(lattice.spacing / 2) - 2 * window.first).astype(np.float32)
     nearest = finer_nearest(places, proven.nearest, where)
-    patches = Patches(seeds, float(seeds[:, 7].max()), nearest)
+    patches = Patches(seeds, nearest)
     coarse_values(window, patches, bricks.arrays)
     line, miss = middle_values(window, patches, bricks.arrays, where)
     refine, stale = np.zeros_like(window.block, dtype=np.bool_), np.zeros_like(window.block, dtype=np.bool_)

@@ -32,12 +32,10 @@ class Patches(NamedTuple):
 
     Args:
         discs: (n, 8) float32, see `isdf.mapping.seeds.surface_seeds`.
-        widest: greatest of their radii [m].
         nearest: (nx, ny, nz) int32 index of the nearest of every second fine node of the window.
     """
 
     discs: Float[np.ndarray, "n 8"]
-    widest: float
     nearest: Int[np.ndarray, "nx ny nz"]
 
 
@@ -156,29 +154,22 @@ def nearest_patch(window, patches, at):
     x = window.step * (window.first[0] * window.ratio + at[0])
     y = window.step * (window.first[1] * window.ratio + at[1])
     z = window.step * (window.first[2] * window.ratio + at[2])
-    discs, widest = patches.discs, np.float32(patches.widest)
-    best, side, number, last = np.float32(1e30), np.float32(1), 0, -1
-    # No patch is nearer whose centre is farther than that [m^2].
-    enough = np.float32(1e30)
+    discs = patches.discs
+    best, side, number = np.float32(1e30), np.float32(1), 0
     for i in range(at[0] // 2, (at[0] + 1) // 2 + 1):
         for j in range(at[1] // 2, (at[1] + 1) // 2 + 1):
             for k in range(at[2] // 2, (at[2] + 1) // 2 + 1):
+                # To work out a patch twice, or one too far away, takes less time than to tell.
                 n = patches.nearest[i, j, k]
-                if n == last:
-                    continue
-                last = n
                 a, b, c = (
                     np.float32(x - discs[n, 0]),
                     np.float32(y - discs[n, 1]),
                     np.float32(z - discs[n, 2]),
                 )
                 away = a * a + b * b + c * c
-                if away > enough:
-                    continue
                 height, radius = a * discs[n, 3] + b * discs[n, 4] + c * discs[n, 5], discs[n, 7]
                 across = max(np.float32(0), np.sqrt(max(np.float32(0), away - height * height)) - radius)
                 square = across * across + height * height
                 if square < best:
                     best, side, number = square, height, n
-                    enough = square + widest * (widest + np.float32(2) * np.sqrt(square))
     return np.sqrt(best), side, number
