@@ -180,7 +180,7 @@ def _may_have(distances, ended, limit):
     return some
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _crossings(near, weights, ended, voxel, limit, first, i, j, k, out):
     """Write position, normal and weight (7,) of the surface in each voxel of a block; returns how many have one."""
