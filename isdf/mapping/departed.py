@@ -1,11 +1,9 @@
-"""Whether who stood close to the camera has visibly gone, though it sees only the upper part of what is close."""
+"""Whether who stood somewhere has visibly gone, though a camera sees only the upper part of who is close to it."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-
-from .evidence import INSIDE
 
 
 def looked_past(
@@ -38,5 +36,5 @@ def looked_past(
     ahead = np.maximum(z, 0.05)
     u, v = (np.floor(c).astype(np.int64) for c in (x / ahead * fx + cx + 0.5, y / ahead * fy + cy + 0.5))
     past = tall & (z > 0.05) & (u >= 0) & (v >= 0) & (u < depth.shape[1]) & (v < depth.shape[0])
-    past[past] = depth[v[past], u[past]] > z[past] + INSIDE
+    past[past] = depth[v[past], u[past]] > z[past] + edge
     return past

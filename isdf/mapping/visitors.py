@@ -24,11 +24,8 @@ from .seeds import ENDED
 from .standing import columns, corners, extend_down, feet, parts, vertical
 from .visited import visited_places
 
-# Seen in one place for longer than this [s], something has come to stay. Whoever walks is through in two, but may wait
-# for a robot for a while.
-STAYS = 5.0
-# What has come to stay is still told from what always stood there for this long [s].
-SETTLES = 10.0
+# Seen in one place for longer than this [s], something has come to stay; who walks may wait for a robot for a while.
+STAYS = 15.0
 # What is nearer than this to the camera [m] is not taken back unless it has visibly gone: close to its own robot a
 # camera sees little.
 NEAR = 1.2
@@ -87,7 +84,6 @@ class Visitors:
         self._offsets = np.argwhere(np.ones((BRICKS,) * 3, dtype=bool))
         self._kept = self._copied(np.empty((0, 3), dtype=np.int64), 0.0)
         self._feet = np.empty((0, 4), dtype=np.int64)
-        self._settled = self._kept
 
     def watch(
         self,
@@ -157,7 +153,7 @@ class Visitors:
         return SIDE * self.bricks.voxel * (self.bricks.corner + corners(under))
 
     def take_back(self, eye: Float[np.ndarray, "3"], now: float) -> Float[np.ndarray, "2 3"] | None:
-        """Give back the places whose visitors have been out of view for long enough.
+        """Give back the places whose visitors have visibly gone, or have been out of view for long enough.
 
         Args:
             eye: where the camera is [m].
@@ -167,15 +163,14 @@ class Visitors:
             The box [m] that is to be refreshed, None where nothing has changed.
         """
         kept = self._kept
-        if self.memory is None or len(kept.place) + len(self._settled.place) == 0:
+        if self.memory is None or len(kept.place) == 0:
             return None
-        stayed = kept.last - kept.first > STAYS
+        stood = kept.last - kept.first
         near = np.linalg.norm(self.edge * (kept.place + 0.5) - eye, axis=1) < NEAR
-        hidden = near & (kept.past <= kept.last)
-        gone = ~stayed & ~hidden & (now - kept.last > self.memory)
-        self._kept = kept.of(~stayed & ~gone)
-        settled = self._settled.and_also(kept.of(stayed))
-        self._settled = settled.of(now - settled.last < SETTLES)
+        # Who stood for a while may stand for as long again.
+        forgotten = ~near & (now - kept.last > np.maximum(self.memory, stood))
+        gone = forgotten | (kept.past > kept.last)
+        self._kept = kept.of(~gone & (stood <= STAYS))
         back = kept.of(gone & np.isfinite(kept.first))
         if len(back.place) == 0:
             return None
@@ -184,7 +179,7 @@ class Visitors:
 
     def lately(self) -> Lately:
         """Where something came and, as far as the camera knows, still is."""
-        kept = self._kept.of(np.isfinite(self._kept.first)).and_also(self._settled)
+        kept = self._kept.of(np.isfinite(self._kept.first))
         row = self._rows(kept.place)
         there = (row >= 0)[..., None] & (self.bricks.weight[row] > 0) & (self.bricks.ended[row] >= ENDED)
         there &= self._nearer(self.bricks.distance[row], kept.distance, kept.weight)
