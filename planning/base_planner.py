@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from planning.chomp import Chomp, ChompConfig
@@ -20,6 +19,7 @@ from planning.protocols import ConfidentField, DistanceField, ObservingField, Sp
 from planning.result import PlanResult
 from planning.threads import one_thread
 from planning.trajectory import Trajectory
+from planning.vain_looks import VainLooks
 from planning.validation import check
 from planning.workspace import Workspace, WorkspaceConfig
 
@@ -99,6 +99,7 @@ class BasePlan:
         onward: (m, 2) how it would go on through unknown or blocked space [m]: what is to be looked at. Empty if it
             reaches the goal or no way leads there.
         came: whether something came into the way, where it was free before.
+        blocker: (2,) where that is [m], as far as the map knows of what came.
     """
 
     result: PlanResult
@@ -106,6 +107,7 @@ class BasePlan:
     dead_end: bool
     onward: Float[Tensor, "m 2"]
     came: bool
+    blocker: Float[Tensor, "2"] | None = None
 
     @property
     def usable(self) -> bool:
@@ -123,22 +125,8 @@ class BasePlan:
 # Something has come where so many positions, into what is blocked now, were free: the edges of walls shift with every
 # image.
 DEEP = 4
-# A way leads on if it is free for so much more [m] than the distance to stand off.
+# A way leads on if the base gets that much farther on it [m].
 FREE = 0.5
-
-
-class _Look(NamedTuple):
-    """The base stood and looked at blocked space in vain.
-
-    Args:
-        when: [s].
-        place: where blocked space would have been entered, (2,) [m].
-        came: whether it was free before.
-    """
-
-    when: float
-    place: Tensor
-    came: bool
 
 
 class BasePlanner:
@@ -155,7 +143,9 @@ class BasePlanner:
 
     def __init__(self, body: SphereRobot, config: BasePlannerConfig | None = None, seed: int = 0) -> None:
         self.body, self.config, self.seed = body, config or BasePlannerConfig(), seed
-        self._looks: list[_Look] = []
+        self._looks = VainLooks(
+            self.config.memory, (self.config.looks, self.config.looks_came), self.config.stand_off
+        )
         self._once_free = OnceFree(self.config.search.spacing)
         self._trodden, self._last = Trodden(), torch.full((2,), torch.inf)
         centres, _ = body.spheres(torch.zeros(2))
@@ -163,7 +153,7 @@ class BasePlanner:
 
     def forget(self) -> None:
         """Forget the dead ends, for another goal."""
-        self._looks = []
+        self._looks.forget()
 
     def stood(self, position: Float[Tensor, "2"]) -> None:
         """Take note that the base has been at a position [m]: space there is free, whether or not it was seen."""
@@ -191,30 +181,38 @@ class BasePlanner:
             now: time [s], to know how old a dead end is.
         """
         self.stood(start)
-        self._looks = [look for look in self._looks if now - look.when < self.config.memory]
         route = route or self.route(start, goal, sdf, now)
-        self._once_free.add(route.grid.free)
         explored = self._explored(sdf)
-        came = self._has_come(route, explored)
+        blocker = self._blocker(route, explored)
+        came = blocker is not None or self._has_come(route, now)
         if route.entry is not None:
-            route = self._to_look_from(route, came)
+            route = self._to_wait_at(route, now) if came else self._to_look_from(route, now)
         result = self._optimised(route, explored)
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
-            self._looks.append(_Look(now, route.entry, came))
-        return BasePlan(result, route.reaches_goal, dead_end, route.onward, came)
+            self._looks.add(now, route.entry, came)
+        return BasePlan(result, route.reaches_goal, dead_end, route.onward, came, blocker)
 
     def route(
         self, start: Float[Tensor, "2"], goal: Float[Tensor, "2"], sdf: DistanceField, now: float = 0.0
     ) -> Route:
         """The way to the goal, past what stayed blocked when it was looked at."""
-        return grid_search(self.body, self._explored(sdf), start, goal, self.config.search, self._closed(now))
+        explored = self._explored(sdf)
 
-    def leads_on(self, route: Route) -> bool:
-        """Whether a way that was blocked by what came is free by now, all of it or the next part."""
+        def passing(places: Tensor, deepest: Tensor) -> Tensor:
+            return self._passing(explored, places, deepest)
+
+        closed = self._looks.closed(now, self.config.search.closed_radius)
+        route = grid_search(self.body, explored, start, goal, self.config.search, closed, passing)
+        self._once_free.add(route.grid.free)
+        return route
+
+    def leads_on(self, route: Route, now: float = 0.0) -> bool:
+        """Whether a way that was blocked by what came is free by now [s], all of it or the next part."""
         if route.entry is None:
             return route.reaches_goal
-        return float((route.entry - route.path[0]).norm()) > self.config.stand_off + FREE
+        path = self._to_wait_at(route, now).path
+        return float((path[-1] - path[0]).norm()) > FREE
 
     def still_good(self, plan: PlanResult, position: Float[Tensor, "2"], sdf: DistanceField) -> bool:
         """Whether what is left of a plan from where the base stands [m] keeps its clearance on a new map."""
@@ -268,48 +266,67 @@ class BasePlanner:
         gaps = (route.path - goal).norm(dim=1)
         return float(gaps[0] - gaps[-1]) < self.config.search.spacing
 
-    def _to_look_from(self, route: Route, came: bool) -> Route:
+    def _to_look_from(self, route: Route, now: float) -> Route:
         """The part of a route that leads to where the space that blocks it is best looked at.
 
         From close by, since most of what is unknown shows itself on the way there; but the last time from `stand_off`,
-        for close to the robot its camera sees nothing. From what came into the way it stands off from the first, but
-        never backs off: what came may walk on at once, and who backs off has to turn away and back again.
+        for close to the robot its camera sees nothing.
         """
         assert route.entry is not None
-        entry, off = route.entry, self.config.stand_off
-        near = (route.path - entry).norm(dim=1) < off
-        if not came:
-            looks = sum(bool((look.place - entry).norm() < off) for look in self._looks)
-            if looks < self.config.looks - 1:
-                return route
-            if near[0]:
-                return replace(route, path=route.grid.way_back(route.path[0], entry, off))
-        end = max(1, int(near.float().argmax())) if near.any() else len(route.path)
-        return replace(route, path=route.path[:end])
+        if self._looks.at(route.entry, now) < self.config.looks - 1:
+            return route
+        if float((route.path[0] - route.entry).norm()) < self.config.stand_off:
+            back = route.grid.way_back(route.path[0], route.entry, self.config.stand_off)
+            return replace(route, path=back)
+        return _until(route, self.config.stand_off)
 
-    def _has_come(self, route: Route, sdf: DistanceField) -> bool:
-        """Whether what blocks the way has come: space was free there, or the field knows that it came."""
+    def _to_wait_at(self, route: Route, now: float) -> Route:
+        """The part of a route that leads to where it waits for what came into the way.
+
+        It stands off from the first, and where it does not stand in the way of what came; but it backs off only after a
+        while: what came may walk on at once, and who backs off has to turn away and back again.
+        """
+        if self._looks.makes_room(route, now):
+            return replace(route, path=self._looks.out_of_the_way(route))
+        near = _until(route, self.config.stand_off)
+        return replace(near, path=self._looks.not_in_the_way(near))
+
+    def _passing(
+        self, sdf: DistanceField, places: Float[Tensor, "m 2"], deepest: Float[Tensor, "m 3"]
+    ) -> Bool[Tensor, " m"]:
+        """Which blocked places were free before something came, as far as the field knows of that."""
+        out = torch.zeros(len(places), dtype=torch.bool)
+        if isinstance(sdf, ExploredField):
+            out = self._once_free.were(places)
+            out[out.clone()] = sdf.by_what_came(deepest[out])
+        return out
+
+    def _has_come(self, route: Route, now: float) -> bool:
+        """Whether what blocks the way has come: space was free there."""
         if route.entry is None:
-            return not route.reaches_goal and any(look.came for look in self._looks)
-        if bool(self._once_free.were(route.onward[:DEEP]).all()):
-            return True
-        if not isinstance(sdf, ExploredField):
-            return False
+            return not route.reaches_goal and self._looks.any_came(now)
+        return bool(self._once_free.were(route.onward[:DEEP]).all())
+
+    def _blocker(self, route: Route, sdf: DistanceField) -> Float[Tensor, "2"] | None:
+        """Where what blocks the way is [m], if the field knows that it came."""
+        if route.entry is None or not isinstance(sdf, ExploredField):
+            return None
         workspace = Workspace(self.body, sdf, eps=1.0, config=self.config.search.workspace)
         centres, radii = self.body.spheres(route.entry)
         clearance = workspace.clearance(centres, radii)
-        solid = clearance < self.config.search.least_margin
-        return bool(solid.any()) and bool(sdf.by_what_came(centres[clearance.argmin()]))
-
-    def _closed(self, now: float) -> Float[Tensor, "c 2"] | None:
-        """Entries into blocked space that stayed blocked however often the robot stood before them and looked."""
-        looks = [look for look in self._looks if now - look.when < self.config.memory]
-        if not looks:
+        deepest = centres[clearance.argmin()]
+        if clearance.min() >= self.config.search.least_margin or not bool(sdf.by_what_came(deepest)):
             return None
-        entries = torch.stack([look.place for look in looks])
-        visits = (torch.cdist(entries, entries) <= self.config.search.closed_radius).sum(dim=1)
-        enough = [self.config.looks_came if look.came else self.config.looks for look in looks]
-        return entries[visits >= torch.tensor(enough)]
+        distance, gradient = sdf.distance_and_gradient(deepest)
+        return (deepest - distance * gradient)[:2]
+
+
+def _until(route: Route, off: float) -> Route:
+    """A route up to where what blocks it is `off` [m] away; its first position at least."""
+    assert route.entry is not None
+    near = (route.path - route.entry).norm(dim=1) < off
+    end = max(1, int(near.float().argmax())) if near.any() else len(route.path)
+    return replace(route, path=route.path[:end])
 
 
 def _gap(path: Float[Tensor, "k 2"], position: Float[Tensor, "2"]) -> float:

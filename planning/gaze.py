@@ -86,7 +86,7 @@ class Gaze:
         ahead = np.array([math.cos(heading), math.sin(heading)])
         looks = [
             (*(state[:2] + distance * ahead), height)
-            for distance, height in ((self.config.near, 0.0), *self.config.looks)
+            for distance, height in ((self.config.near, 0.0), self.config.looks[-1], *self.config.looks)
         ]
         self._nod(looks, state)
 

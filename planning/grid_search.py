@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
@@ -17,6 +20,8 @@ from planning.errors import ConfigError, TrajectoryError
 from planning.numbers import refuse_nan
 from planning.protocols import DistanceField, SphereRobot
 from planning.workspace import Workspace, WorkspaceConfig
+
+Passing = Callable[[Float[Tensor, "m 2"], Float[Tensor, "m 3"]], Bool[Tensor, " m"]]
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,8 @@ class GridSearchConfig:
             blocked space up to where that begins, such as a doorway. inf: never.
         through_unknown: the same for a way through unknown space, however near to something the field guesses it to
             be: else the route would lead through a wall that was seen rather than round it.
+        through_passing: the same for a way through what is likely to have moved on when the robot gets there. Where the
+            way round it counts more, the route ends before it even though a free way leads to the goal.
         closed_radius: blocked space this near [m] to a closed place is never entered.
         workspace: rules for the floor and for unknown space, which counts as blocked.
     """
@@ -49,16 +56,17 @@ class GridSearchConfig:
     escape: float = 0.25
     through_blocked: float = math.inf
     through_unknown: float = math.inf
+    through_passing: float = 3.0
     closed_radius: float = 0.6
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
 
     def __post_init__(self) -> None:
         refuse_nan(self)
-        prices = min(self.caution, self.through_blocked, self.through_unknown)
+        prices = min(self.caution, self.through_blocked, self.through_unknown, self.through_passing)
         if min(self.spacing, self.padding) <= 0 or self.margin <= self.least_margin or not prices >= 1:
             raise ConfigError(
                 "GridSearchConfig: spacing and padding must be positive, margin above least_margin and caution, "
-                f"through_blocked and through_unknown at least 1, got {self}."
+                f"through_blocked, through_unknown and through_passing at least 1, got {self}."
             )
 
 
@@ -71,12 +79,14 @@ class SearchGrid:
         shape: positions along x and y; n is their product.
         spacing: between neighbours [m].
         cost: (n,) inf where blocked or unknown.
+        open: (n,) free, unknown, or blocked only by what is passing.
     """
 
     positions: Float[Tensor, "n 2"]
     shape: tuple[int, int]
     spacing: float
     cost: Float[Tensor, "n"]
+    open: Bool[Tensor, "n"]
 
     @property
     def free(self) -> Float[Tensor, "f 2"]:
@@ -86,6 +96,33 @@ class SearchGrid:
     def nearest(self, place: Float[Tensor, "2"]) -> int:
         """Number of the position closest to a place [m]."""
         return int((self.positions - place).norm(dim=1).argmin())
+
+    def room(self, way: Float[Tensor, "m 2"], robot: Float[Tensor, "2"], apart: float) -> float:
+        """Open area [m^2] that can be reached from a way [m] without coming nearer to a robot [m] than `apart` [m].
+
+        Of several areas that the way leads through the largest; inf if it is nowhere open and so far away.
+        """
+        far = self.open & ((self.positions - robot).norm(dim=1) >= apart)
+        regions, _ = label(far.numpy().reshape(self.shape))
+        on_way = regions.ravel()[[self.nearest(place) for place in way]]
+        sizes = np.bincount(regions.ravel())[on_way[on_way > 0]]
+        return float(sizes.max()) * self.spacing**2 if len(sizes) else math.inf
+
+    def nearest_with_room(
+        self, start: Float[Tensor, "2"], way: Float[Tensor, "m 2"], apart: float, area: float
+    ) -> Float[Tensor, "k 2"]:
+        """The cheapest path [m] to where a robot leaves more `room` than an area [m^2]; or the start, if nowhere."""
+        reach, before = _search(self.cost, self.shape, self.spacing, self.nearest(start))
+        far = -math.inf
+        for cell in reach.argsort().tolist():
+            if not math.isfinite(reach[cell]):
+                break
+            if reach[cell] < far + 2 * self.spacing:
+                continue
+            far = float(reach[cell])
+            if self.room(way, self.positions[cell], apart) > area:
+                return torch.cat([start[None], self.positions[_traced(before, cell)][1:]])
+        return start[None]
 
     def way_back(
         self, start: Float[Tensor, "2"], place: Float[Tensor, "2"], distance: float
@@ -129,6 +166,7 @@ def grid_search(
     goal: Float[Tensor, "2"],
     config: GridSearchConfig | None = None,
     closed: Float[Tensor, "c 2"] | None = None,
+    passing: Passing | None = None,
 ) -> Route:
     """Search the cheapest path of a robot with q = (x, y).
 
@@ -139,6 +177,8 @@ def grid_search(
         goal: position [m].
         config: see `GridSearchConfig`.
         closed: places [m] where blocked space was found to be blocked indeed.
+        passing: tells of blocked positions (m, 2) [m], and of the centres (m, 3) [m] of the spheres that are deepest in
+            what blocks them, whether that is likely to move on (m,).
 
     Raises:
         TrajectoryError: if the robot has not two joints, or start or goal is not finite.
@@ -151,25 +191,29 @@ def grid_search(
             f"grid_search: start and goal must be finite, got {start.tolist()} and {goal.tolist()}."
         )
     positions, shape = _grid(start, goal, config)
-    cost, price = _costs(robot, sdf, positions, start, config)
-    grid = SearchGrid(positions, shape, config.spacing, cost)
+    costs = _costs(robot, sdf, positions, start, config, passing)
+    grid = SearchGrid(positions, shape, config.spacing, costs.free, costs.open)
     near_start, near_goal = grid.nearest(start), grid.nearest(goal)
-    reach, before = _search(cost, shape, config.spacing, near_start)
-    if torch.isfinite(reach[near_goal]):
-        path = torch.cat([start[None], positions[_traced(before, near_goal)][1:-1], goal[None]])
-        return Route(path, True, path[:0], grid)
+    shut = torch.zeros(len(positions), dtype=torch.bool)
     if closed is not None and len(closed):
-        near = torch.cdist(positions, closed).amin(dim=1) <= config.closed_radius
-        price = price.masked_fill(torch.isinf(cost) & near, torch.inf)
-    through, before_through = _search(price, shape, config.spacing, near_start)
-    if torch.isfinite(through[near_goal]):
-        cells = _traced(before_through, near_goal)
-        first = int(torch.isinf(cost[cells]).float().argmax())
-        path = torch.cat([start[None], positions[cells[1:first]]])
-        return Route(path, False, positions[cells[first:]], grid)
+        shut = torch.isinf(costs.free) & (torch.cdist(positions, closed).amin(dim=1) <= config.closed_radius)
+    for cost in (costs.waiting, costs.price):
+        reach, before = _search(cost.masked_fill(shut, torch.inf), shape, config.spacing, near_start)
+        if torch.isfinite(reach[near_goal]):
+            return _up_to_what_blocks(grid, _traced(before, near_goal), start, goal)
+    reach, before = _search(costs.free, shape, config.spacing, near_start)
     gap = (positions - goal).norm(dim=1).masked_fill(~torch.isfinite(reach), torch.inf)
     cells = _traced(before, int(gap.argmin()))
     return Route(torch.cat([start[None], positions[cells][1:]]), False, positions[:0], grid)
+
+
+def _up_to_what_blocks(grid: SearchGrid, cells: list[int], start: Tensor, goal: Tensor) -> Route:
+    """The route along some cells to the goal, or to the first that is blocked."""
+    blocked, way = torch.isinf(grid.cost[cells]), grid.positions[cells]
+    if blocked.any():
+        first = int(blocked.float().argmax())
+        return Route(torch.cat([start[None], way[1:first]]), False, way[first:], grid)
+    return Route(torch.cat([start[None], way[1:-1], goal[None]]), True, way[:0], grid)
 
 
 def _search(
@@ -204,19 +248,40 @@ def _grid(
     return grid.reshape(-1, 2), (len(axes[0]), len(axes[1]))
 
 
+class _Costs(NamedTuple):
+    """What a metre of way counts at each position.
+
+    Args:
+        free: inf where blocked or unknown.
+        waiting: with what is passing at its price.
+        price: with all that is blocked or unknown at its price.
+        open: see `SearchGrid`.
+    """
+
+    free: Float[Tensor, "n"]
+    waiting: Float[Tensor, "n"]
+    price: Float[Tensor, "n"]
+    open: Bool[Tensor, "n"]
+
+
 def _costs(
-    robot: SphereRobot, sdf: DistanceField, positions: Tensor, start: Tensor, config: GridSearchConfig
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """What a metre of way counts at each position: inf where blocked; and with blocked space at its price."""
+    robot: SphereRobot,
+    sdf: DistanceField,
+    positions: Tensor,
+    start: Tensor,
+    config: GridSearchConfig,
+    passing: Passing | None,
+) -> _Costs:
     workspace = Workspace(robot, sdf, eps=1.0, config=config.workspace)
     away = (positions - start).norm(dim=1)
     here = int(away.argmin())
-    clearance = _clearance_of_a_few(robot, workspace, positions)
+    clearance, deepest = _clearance_of_a_few(robot, workspace, positions)
     unknown = torch.zeros(len(positions), dtype=torch.bool)
     # What a few spheres find blocked is blocked, and need not be known better, except where the robot may escape.
     for block in ((clearance >= config.least_margin) | (away <= config.escape)).nonzero()[:, 0].split(500):
         centres, radii = robot.spheres(positions[block])
-        clearance[block] = workspace.clearance(centres, radii).amin(dim=-1)
+        clearance[block], which = workspace.clearance(centres, radii).min(dim=-1)
+        deepest[block] = centres[torch.arange(len(block)), which]
         hidden = workspace.unknown(centres)
         if hidden is not None:
             unknown[block] = hidden.any(dim=-1)
@@ -226,22 +291,32 @@ def _costs(
     unknown &= ~escape
     price = (1 + (config.caution - 1) * short).masked_fill(solid, config.through_blocked)
     cost = price.masked_fill(solid | unknown, torch.inf)
-    return cost, price.masked_fill(unknown & ~solid, config.through_unknown)
+    price = price.masked_fill(unknown & ~solid, config.through_unknown)
+    waiting, open_ = cost.clone(), ~solid
+    if passing is not None and solid.any():
+        gone = solid.clone()
+        gone[solid] = passing(positions[solid], deepest[solid])
+        waiting[gone] = price[gone] = config.through_passing
+        open_ |= gone
+    return _Costs(cost, waiting, price, open_)
 
 
 def _clearance_of_a_few(
     robot: SphereRobot, workspace: Workspace, positions: Float[Tensor, "n 2"]
-) -> Float[Tensor, "n"]:
-    """The least clearance [m] of every eighth sphere that may not touch the floor."""
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
+    """The least clearance [m] of every eighth sphere that may not touch the floor, and that sphere's centre [m]."""
     few = torch.arange(len(robot.spheres(positions[:1])[1]))
     if workspace.floor is not None:
         few = few[~workspace.floor]
     few = few[::8]
-    out = torch.full((len(positions),), torch.inf, dtype=positions.dtype)
+    least = torch.full((len(positions),), torch.inf, dtype=positions.dtype)
+    deepest = torch.zeros((len(positions), 3), dtype=positions.dtype)
     for block in torch.arange(len(positions)).split(2000) if len(few) else ():
         centres, radii = robot.spheres(positions[block])
-        out[block] = (workspace.field.distance(centres[:, few]) - radii[few]).amin(dim=-1)
-    return out
+        centres = centres[:, few]
+        least[block], which = (workspace.field.distance(centres) - radii[few]).min(dim=-1)
+        deepest[block] = centres[torch.arange(len(block)), which]
+    return least, deepest
 
 
 def _graph(cost: Float[ndarray, "n"], shape: tuple[int, int], spacing: float) -> csr_array:

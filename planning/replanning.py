@@ -248,7 +248,7 @@ class ReplanningLoop:
         start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
         end = torch.as_tensor(goal, dtype=torch.float32)
         route = self.planner.route(start, end, self.field, self.robot.time) if pausing else None
-        if route is not None and not self.planner.leads_on(route):
+        if route is not None and not self.planner.leads_on(route, self.robot.time):
             return None
         plan = self.plan or self.giving_way.plan
         if plan is not None:
@@ -266,6 +266,8 @@ class ReplanningLoop:
         self._onward = fresh.onward.numpy().astype(float)
         if fresh.came and not len(self._onward):
             self._onward = goal[None]
+        if not fresh.usable and fresh.blocker is not None:
+            self._onward = fresh.blocker.numpy().astype(float)[None]
         if fresh.usable:
             # A plan that the base cannot begin to follow is as good as none.
             gone = float(np.linalg.norm(self.robot.base_state()[:2] - self._failed_at))

@@ -14,7 +14,7 @@ from torch import Tensor
 from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.drive import DriveStatus
 from planning.explored import ExploredField, Trodden
-from planning.gaze import GazeConfig
+from planning.gaze import Gaze, GazeConfig
 from planning.grid_search import GridSearchConfig, grid_search
 from planning.protocols import ChangingField, ObservingField
 from planning.replanning import ReplanningLoop
@@ -210,6 +210,15 @@ def test_the_camera_nods() -> None:
     heights = np.array(robot.looked_at)[:, 2]
     assert set(heights.tolist()) == {height for _, height in QUICK.gaze.looks}
     assert np.flatnonzero(np.diff(heights)).size > 4
+
+
+def test_every_other_look_round_is_at_level() -> None:
+    robot, gaze = Unicycle(), GazeConfig()
+    for _ in range(8):
+        Gaze(robot, gaze).towards(robot.base_state(), 0.0)
+        robot.time += gaze.nod
+    low = [(0.7, 0.0), (1.5, 1.1), (1.0, 0.0), (1.5, 1.1)]
+    assert [(x, z) for x, _, z in robot.looked_at] == 2 * low
 
 
 @pytest.mark.parametrize("values", [{"nod": 0.0}, {"looks": ()}, {"looks": ((-1.0, 0.0),)}, {"near": 0.0}])

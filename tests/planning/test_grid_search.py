@@ -260,3 +260,54 @@ def test_a_free_way_is_never_given_up_for_a_shorter_blocked_one() -> None:
     wall = Box((1.5, 0.0, 0.5), (0.1, 2.0, 1.0))
     route = grid_search(ROBOT, wall, START, GOAL, replace(EXPLORING, through_blocked=1.0))
     assert route.reaches_goal and checked(route, wall).clearance > 0
+
+
+# A wall with a passage on the way, in which somebody stands, and a way round its end.
+PASSAGE = Union(Box((1.5, 1.5, 0.5), (0.1, 1.0, 1.0)), Box((1.5, -3.5, 0.5), (0.1, 3.0, 1.0)))
+SOMEBODY = Box((1.5, 0.0, 0.5), (0.2, 0.5, 1.0))
+
+
+@pytest.mark.parametrize(("price", "waits"), [(1.0, True), (3.0, True), (20.0, False)])
+def test_what_is_passing_is_let_pass_unless_the_way_round_is_short(price: float, waits: bool) -> None:
+    def passing(places: torch.Tensor, deepest: torch.Tensor) -> torch.Tensor:
+        assert places.shape[1] == 2 and deepest.shape == (len(places), 3)
+        return SOMEBODY.distance(deepest) <= PASSAGE.distance(deepest)
+
+    field, config = Union(PASSAGE, SOMEBODY), replace(EXPLORING, through_passing=price)
+    route = grid_search(ROBOT, field, START, GOAL, config, None, passing)
+    assert route.reaches_goal != waits and checked(route, field).clearance > -0.03
+    if not waits:
+        assert float(route.path[:, 1].max()) > 2.5
+        return
+    assert route.entry is not None and abs(float(route.entry[1])) < 0.5
+    around = grid_search(ROBOT, field, START, GOAL, config, route.entry[None], passing)
+    assert around.reaches_goal, "closed to what is passing, too"
+    assert grid_search(ROBOT, field, START, GOAL, config).reaches_goal, "nothing is passing"
+
+
+def test_what_is_always_there_never_passes() -> None:
+    route = grid_search(
+        ROBOT, PASSAGE, START, GOAL, EXPLORING, None, lambda places, _: torch.zeros(len(places)).bool()
+    )
+    assert route.reaches_goal and checked(route, PASSAGE).clearance > 0
+
+
+def test_room_is_left_where_the_robot_stands_far_enough_aside() -> None:
+    """A corridor, shut at its far end, opens into free space at x = 1.5."""
+    corridor = Union(
+        Box((3.0, 0.8, 0.5), (1.5, 0.1, 1.0)),
+        Box((3.0, -0.8, 0.5), (1.5, 0.1, 1.0)),
+        Box((4.5, 0.0, 0.5), (0.1, 0.9, 1.0)),
+    )
+    before, goal = torch.tensor([1.0, 0.0]), torch.tensor([4.0, 0.0])
+    route = grid_search(ROBOT, corridor, before, goal)
+    grid, way = route.grid, route.path
+    assert 0.5 < grid.room(way, before, 1.0) < 3.0, "the corridor but for its mouth"
+    assert grid.room(way, torch.tensor([-0.5, 0.0]), 1.0) > 20.0
+    assert grid.room(way[:3], before, 1.0) == math.inf
+    assert grid.room(torch.cat([way, torch.tensor([[4.0, 2.0]])]), before, 1.0) > 20.0, "the largest counts"
+    path = grid.nearest_with_room(before, way, 1.0, 6.0)
+    assert torch.equal(path[0], before) and grid.room(way, path[-1], 1.0) > 6.0
+    assert 0.2 < float(path.diff(dim=0).norm(dim=1).sum()) < 1.5
+    inside = torch.tensor([3.9, 0.0])
+    assert len(grid.nearest_with_room(inside, way, 9.0, 6.0)) == 1, "nowhere"

@@ -13,7 +13,7 @@ from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.drive import DriveStatus
 from planning.grid_search import GridSearchConfig, grid_search
 from planning.once_free import OnceFree
-from tests.planning.fields import Box
+from tests.planning.fields import Box, Cylinder, Union
 from tests.planning.test_replanning import BODY, FREE, QUICK, drive
 from tests.planning.unicycles import Unicycle
 
@@ -101,6 +101,86 @@ def test_what_the_field_knows_to_have_come_is_kept_off_though_nothing_was_free_t
     assert plan.came == came
     gap = float((plan.onward[0] - plan.result.trajectory.waypoints[-1]).norm())
     assert 1.0 <= gap < 1.2 if came else gap < 0.2
+
+
+# A wall with a passage on the way, in which somebody stands from some x on, and a way round its end.
+WALL = Union(Box((2.0, 1.5, 0.5), (0.1, 0.8, 1.0)), Box((2.0, -31.0, 0.5), (0.1, 30.3, 1.0)))
+
+
+class Passage(Union):
+    """The wall, perhaps with somebody in the passage; what is in the passage came there, or was always there."""
+
+    def __init__(self, *parts, came: bool = False) -> None:
+        super().__init__(WALL, *parts)
+        self.came_there = came
+
+    def observed(self, points: torch.Tensor) -> torch.Tensor:
+        return torch.ones(points.shape[:-1], dtype=torch.bool)
+
+    def came(self, points: torch.Tensor) -> torch.Tensor:
+        return (points[..., 1].abs() < 0.6) & torch.tensor(self.came_there)
+
+
+@pytest.mark.parametrize("came", [True, False])
+@pytest.mark.parametrize("before", [True, False])
+def test_who_came_into_the_way_is_waited_for_though_there_is_a_way_round(came: bool, before: bool) -> None:
+    config = BasePlannerConfig()
+    config = replace(config, search=replace(config.search, through_passing=1.5))
+    planner, person = BasePlanner(BODY, config), Box((2.0, 0.0, 0.5), (0.2, 0.5, 1.0))
+    if before:
+        assert planner.plan(START, GOAL, Passage()).reaches_goal
+    plan = planner.plan(START, GOAL, Passage(person, came=came), now=1.0)
+    assert plan.usable and plan.reaches_goal != (came and before)
+    if came and before:
+        assert plan.blocker is not None and plan.came
+        torch.testing.assert_close(plan.blocker, torch.tensor([1.8, 0.0]), atol=0.3, rtol=0.0)
+
+
+# A dead end 1.6 m wide that opens at x = 1, and somebody in its mouth.
+NOOK = Union(
+    *(Box((2.2, y, 0.5), (1.2, 0.1, 1.0)) for y in (-0.9, 0.9)), Box((3.4, 0.0, 0.5), (0.1, 1.0, 1.0))
+)
+
+
+class Entered(Union):
+    """The walls, perhaps with somebody who came."""
+
+    def observed(self, points: torch.Tensor) -> torch.Tensor:
+        return torch.ones(points.shape[:-1], dtype=torch.bool)
+
+    def came(self, points: torch.Tensor) -> torch.Tensor:
+        return (points[..., 0] < 2.0) & (points[..., 1].abs() < 0.5)
+
+
+@pytest.mark.parametrize("shut_in", [True, False])
+def test_who_is_shut_in_by_the_robot_is_given_room_once(shut_in: bool) -> None:
+    walls = NOOK if shut_in else Union(*NOOK.parts[:2])
+    person, goal, near = Cylinder((1.6, 0.0), 0.3), torch.tensor([2.8, 0.0]), torch.tensor([0.1, 0.0])
+    planner, occupied = BasePlanner(BODY), Entered(walls, person)
+    planner.plan(near, goal, Entered(walls))
+    plans = [planner.plan(near, goal, occupied, now=1.0 + n) for n in range(5)]
+    assert [plan.dead_end for plan in plans] == 4 * [True] + [not shut_in]
+    if not shut_in:
+        return
+    back, route = plans[-1].result.trajectory.waypoints[-1], planner.route(near, goal, occupied)
+    rooms = [route.grid.room(route.onward, place, 1.0) for place in (near, back)]
+    assert rooms[0] < 3.0 < 20.0 < rooms[1]
+    assert planner.plan(back, goal, occupied, now=10.0).dead_end, "it stays there"
+    far = planner.route(torch.tensor([-2.5, 0.0]), goal, occupied)
+    assert not planner.leads_on(planner.route(back, goal, occupied), 10.0) and planner.leads_on(far, 27.0)
+
+
+@pytest.mark.parametrize("shut_in", [True, False])
+def test_it_waits_where_it_shuts_in_nobody(shut_in: bool) -> None:
+    walls = NOOK if shut_in else Union(*NOOK.parts[:2])
+    person, goal, far = Cylinder((1.6, 0.0), 0.3), torch.tensor([2.8, 0.0]), torch.tensor([-2.0, 0.0])
+    planner, occupied = BasePlanner(BODY), Entered(walls, person)
+    planner.plan(far, goal, Entered(walls))
+    plan, route = planner.plan(far, goal, occupied, now=1.0), planner.route(far, goal, occupied)
+    end = plan.result.trajectory.waypoints[-1]
+    assert plan.usable and route.grid.room(route.onward, end, 1.2) > 20.0
+    assert (float((end - plan.onward[0]).norm()) < 1.2) != shut_in
+    assert not planner.leads_on(planner.route(end, goal, occupied), 2.0)
 
 
 def test_the_robot_waits_for_what_came_and_goes_on_when_it_is_gone() -> None:
