@@ -148,6 +148,7 @@ class ReplanningLoop:
             goal, spent = self.goal, self._sense_and_map()
             leads_to_goal = self.plan is not None and self._to_goal
             fresh, planning = self._plan_if_needed(goal)
+            leads_to_goal &= self.plan is not None  # else it was given up, and is not followed
             self._follow(spent + planning, final_yaw)
             self.plan = None if self._stuck() else fresh
             self.report.rounds += 1

@@ -225,6 +225,22 @@ def test_it_follows_what_came_and_has_walked_on() -> None:
     assert 3.0 < robot.state[0] < 4.0, "not all the way is free, but the next part"
 
 
+def test_a_way_that_opens_for_a_moment_only_is_not_taken_for_driven() -> None:
+    robot, opened = Unicycle(), []
+    shut = Box((5.0, 0.0, 0.5), (0.3, 1000.0, 1.0))
+    config = replace(QUICK, planner=BasePlannerConfig(), wait=30.0, time_limit=25.0)
+
+    def knows():
+        if robot.time > 18.0 and not opened:
+            opened.append(robot.time)
+            return FREE
+        return shut if robot.time > 3.0 else FREE
+
+    loop, report = drive(robot, knows, config, goal=np.array([6.0, 0.0]))
+    assert opened and loop.report.failed_plans > 1 and not report.success
+    assert report.goal_distance > 1.0
+
+
 def test_what_came_and_stays_is_given_up() -> None:
     robot = Unicycle()
     config = replace(QUICK, planner=BasePlannerConfig(), time_limit=200.0)
