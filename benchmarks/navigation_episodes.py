@@ -101,7 +101,6 @@ def make_tasks(options: Navigate) -> list[NavigationTask]:
         if start is None or np.linalg.norm(start - goal) < APART:
             continue
         number, yaw = len(tasks), float(rng.uniform(-np.pi, np.pi))
-        walkable = places[rng.choice(len(places), min(len(places), 800), replace=False)]
         tasks.append(
             NavigationTask(
                 str((folder / f"{number:03d}").resolve()),
@@ -114,7 +113,7 @@ def make_tasks(options: Navigate) -> list[NavigationTask]:
                 (float(goal[0]), float(goal[1])),
                 floor.shortest(start, goal),
                 _furniture(scene, floor, start, goal, rng) if options.disturb == "moved" else None,
-                tuple(map(tuple, walkable.tolist())) if options.disturb == "people" else (),
+                tuple(map(tuple, places.tolist())) if options.disturb == "people" else (),
             )
         )
     if len(tasks) < options.episodes:

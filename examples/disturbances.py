@@ -9,6 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from robots.simulation import Cylinder, DepthFrame, SimulatedMobileRobot
 from robots.simulation.poses import planar_pose
@@ -135,11 +137,11 @@ class SensorFault:
 
 
 PATIENCE = 1.5
-"""People wait about this long for a robot in their way [s]."""
+"""People wait about this long for a robot, or for each other, in their way [s]."""
 
 
 class People:
-    """Cylinders as large as people walk to and fro between free places.
+    """Cylinders as large as people walk by the shortest ways from one place to another.
 
     Like people they do not walk into what stands in their way: they wait while the robot is closer than `courtesy`, and
     after a while go elsewhere.
@@ -159,18 +161,20 @@ class People:
         self, free: Float[ndarray, "n 2"], spacing: float, seed: int, count: int = 3, speed: float = 0.5,
         courtesy: float = 0.75,
     ) -> None:  # fmt: skip
-        self._free, self._step, self.speed, self.courtesy = free, 1.5 * spacing, speed, courtesy
+        self._free, self.speed, self.courtesy = free, speed, courtesy
+        self._tree = cKDTree(free)
+        self._graph = self._tree.sparse_distance_matrix(self._tree, 1.5 * spacing).tocsr()
         self._rng = np.random.default_rng([seed, 47])
         self.names = tuple(f"person_{i}" for i in range(count))
         self._places: list[Planar] = []
-        self._headings = self._rng.uniform(-np.pi, np.pi, count)
+        self._ways = [np.empty((0, 2))] * count
 
     def frame(self, frame: DepthFrame | None) -> DepthFrame | None:
         """People are seen like everything else."""
         return frame
 
     def advance(self, robot: SimulatedMobileRobot, duration: float) -> None:
-        """Walk on; each turns to another direction where the way is not free."""
+        """Walk on, each to where he wants to go next."""
         here = robot.base_state()[:2]
         if not self._places:
             self._enter(robot, here)
@@ -188,21 +192,49 @@ class People:
             robot.world.add_body(Cylinder(name, pose, self.RADIUS, self.HEIGHT, colour=(0.8, 0.5, 0.3)))
 
     def _walked(self, i: int, robot: Planar, duration: float) -> Planar:
+        """Where a person is after some time [s]."""
         place = self._places[i]
-        for _ in range(12):
-            angle = self._headings[i]
-            there = place + self.speed * duration * np.array([np.cos(angle), np.sin(angle)])
-            others = [p for j, p in enumerate(self._places) if j != i]
-            apart = min((float(np.linalg.norm(there - p)) for p in others), default=np.inf)
-            if np.linalg.norm(self._free - there, axis=1).min() <= self._step and apart > 3 * self.RADIUS:
-                gap, before = (float(np.linalg.norm(p - robot)) - self.RADIUS for p in (there, place))
-                if gap >= min(before, self.courtesy):
-                    return there
-                if self._rng.random() < duration / PATIENCE:
-                    self._headings[i] += self._rng.uniform(0.5, 2.5)
-                return place
-            self._headings[i] += self._rng.uniform(0.5, 2.5)
+        if len(self._ways[i]) == 0:
+            self._ways[i] = self._way_elsewhere(place, robot)
+        there, way = _along(place, self._ways[i], self.speed * duration)
+        if self._may_walk(i, there, robot):
+            self._ways[i] = way
+            return there
+        if self._rng.random() < duration / PATIENCE:
+            self._ways[i] = self._way_elsewhere(place, robot)
         return place
+
+    def _way_elsewhere(self, place: Planar, robot: Planar) -> Float[ndarray, "k 2"]:
+        """The shortest way to any other place [m] that does not lead past the robot."""
+        start = int(self._tree.query(place)[1])
+        away = np.linalg.norm(self._free - robot, axis=1)
+        open_ = away >= min(self.RADIUS + self.courtesy, away[start])
+        free, here = self._free[open_], int(open_[:start].sum())
+        far, before = dijkstra(self._graph[open_][:, open_], indices=here, return_predecessors=True)
+        way = [int(self._rng.choice(np.flatnonzero(np.isfinite(far))))]
+        while before[way[-1]] >= 0:
+            way.append(int(before[way[-1]]))
+        return free[way[::-1]][1:]
+
+    def _may_walk(self, i: int, there: Planar, robot: Planar) -> bool:
+        """Whether a step brings a person too near neither to the robot nor to others; away from them it may lead."""
+        gaps = [(robot, self.RADIUS + self.courtesy)]
+        gaps += [(place, 3 * self.RADIUS) for j, place in enumerate(self._places) if j != i]
+        return all(
+            np.linalg.norm(there - other) >= min(gap, float(np.linalg.norm(self._places[i] - other)))
+            for other, gap in gaps
+        )
+
+
+def _along(place: Planar, way: Float[ndarray, "k 2"], length: float) -> tuple[Planar, Float[ndarray, "m 2"]]:
+    """A place that is `length` [m] farther along a way, and the rest of the way."""
+    for n, corner in enumerate(way):
+        step = corner - place
+        far = float(np.linalg.norm(step))
+        if far > length:
+            return place + length / far * step, way[n:]
+        place, length = corner, length - far
+    return place, way[:0]
 
 
 class MovedFurniture:

@@ -164,6 +164,20 @@ def test_people_walk_in_free_space_and_wait_for_the_robot() -> None:
     assert gaps.min() > 2 * People.RADIUS
 
 
+def test_people_walk_from_place_to_place_through_passages() -> None:
+    axis = np.arange(-2, 2.05, 0.1)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    grid = grid[(np.abs(grid[:, 0]) > 0.35) | (np.abs(grid[:, 1]) < 0.15)]  # two rooms and a passage
+    robot, people = StandIn(9.0, 9.0), People(grid, 0.1, seed=1, count=1)
+    way = []
+    for _ in range(3000):
+        people.advance(robot, 0.1)
+        way.append(robot.poses["person_0"][:2, 3])
+    x, y = np.array(way).T
+    assert np.abs(y[np.abs(x) < 0.3]).max() < 0.15, "not through the wall"
+    assert np.count_nonzero(np.diff(np.sign(x))) > 10, "from room to room"
+
+
 def test_furniture_is_moved_once_when_it_is_time() -> None:
     robot = StandIn(0.0, 0.0)
     robot.poses["chair"] = planar_pose(1.0, 1.0, 0.4)
