@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from planning.errors import ConfigError
@@ -22,4 +23,4 @@ def refuse_nan(config: Any) -> None:
 def _holds_nan(value: Any) -> bool:
     if isinstance(value, tuple):
         return any(map(_holds_nan, value))
-    return isinstance(value, float) and value != value
+    return isinstance(value, float) and math.isnan(value)

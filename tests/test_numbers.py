@@ -8,6 +8,7 @@ import math
 import pkgutil
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 import planning.numbers
@@ -58,5 +59,6 @@ def test_nan_in_a_tuple_is_refused_and_what_is_no_number_is_left_alone(error: ty
 
     refuse_nan = REFUSALS[error]
     refuse_nan(Odd(((1.0, 2), "nan", None)))
+    refuse_nan(Odd((np.float64(1.0),), np.float64(2.0)))
     with pytest.raises(error, match=r"Odd: pairs must be a number"):
         refuse_nan(Odd(((1.0, 2), (3.0, math.nan))))
