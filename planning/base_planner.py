@@ -107,7 +107,7 @@ class BasePlan:
     dead_end: bool
     onward: Float[Tensor, "m 2"]
     came: bool
-    blocker: Float[Tensor, "2"] | None = None
+    blocker: Float[Tensor, "2"] | None
 
     @property
     def usable(self) -> bool:

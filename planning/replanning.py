@@ -146,7 +146,7 @@ class ReplanningLoop:
         self.tracker.reset()
         while self.robot.time - started < self.config.time_limit:
             goal, spent = self.goal, self._sense_and_map()
-            leads_to_goal = self.plan is not None and self._to_goal
+            leads_to_goal = self.leads_to_goal
             fresh, planning = self._plan_if_needed(goal)
             leads_to_goal &= self.plan is not None  # else it was given up, and is not followed
             self._follow(spent + planning, final_yaw)

@@ -97,4 +97,4 @@ class VainLooks:
         return self._looks
 
     def _near(self, look: _Look, place: Float[Tensor, "2"]) -> bool:
-        return bool((look.place - place).norm() < max(self.near, 1e-6))
+        return bool((look.place - place).norm() <= self.near)

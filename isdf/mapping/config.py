@@ -26,8 +26,9 @@ class MapperConfig:
         fuse_period: least frame time between two images that are fused [s]: those between show hardly more.
         refresh_period: least frame time between two refreshes of the distances [s].
         guess_period: least frame time between two runs of the network [s].
-        visitors: what came into free space, was not seen to stay and has been out of view for this long [s] is taken
-            back out of the map, for somebody who walks by does not stand where the camera saw him last; None: never.
+        visitors: what came into free space, was not seen to stay and has been out of view for this long [s], or for as
+            long as it had stood there, is taken back out of the map, for somebody who walks by does not stand where the
+            camera saw him last; None: never.
         max_bricks: a frame that needs a larger table of bricks (of eight voxels a side) is refused.
     """
 

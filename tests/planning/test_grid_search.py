@@ -214,6 +214,8 @@ def test_a_goal_that_is_no_place_is_refused(bad: float) -> None:
         {"margin": 0.1, "least_margin": 0.1},
         {"margin": -0.2},
         {"caution": 0.5},
+        {"through_passing": 0.5},
+        {"through_passing": math.nan},
     ],
 )
 def test_bad_settings_are_refused(values: dict) -> None:
