@@ -155,7 +155,7 @@ def episode(task: NavigationTask) -> dict:
         if loop.report.plans > len(planning_times):
             planning_times.append(loop.last_planning)
 
-    config = ReplanningConfig(time_limit=60.0 + 10.0 * task.shortest)
+    config = ReplanningConfig(time_limit=120.0 + 10.0 * task.shortest)
     loop = ReplanningLoop(
         ride.robot, ride.body, ride.mapper, ride.field_for_driving, config, ride.clock(), watch, task.number,
         ride.monitor,

@@ -10,8 +10,9 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from examples.episode import Episode
-from planning.grid_search import GridSearchConfig, grid_search
+from planning.grid_search import grid_search
 from planning.path_reference import wrapped
+from planning.position_costs import GridSearchConfig
 from planning.tracking import BaseTracker, TrackerConfig
 
 ROUTE = GridSearchConfig(margin=0.3)

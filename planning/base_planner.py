@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field, replace
 
@@ -10,11 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from planning.chomp import Chomp, ChompConfig
+from planning.descent import DescentConfig
 from planning.errors import ConfigError
 from planning.explored import ExploredField, Trodden
-from planning.grid_search import GridSearchConfig, Route, grid_search
+from planning.grid_search import Route, grid_search
 from planning.numbers import refuse_nan
 from planning.once_free import OnceFree
+from planning.position_costs import GridSearchConfig
 from planning.protocols import ConfidentField, DistanceField, ObservingField, SphereRobot
 from planning.result import PlanResult
 from planning.threads import one_thread
@@ -22,6 +25,9 @@ from planning.trajectory import Trajectory
 from planning.vain_looks import VainLooks
 from planning.validation import check
 from planning.workspace import Workspace, WorkspaceConfig
+
+# Of however short a plan.
+MIN_WAYPOINTS = 12
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,8 @@ class BasePlannerConfig:
     Args:
         search: finds the route that CHOMP starts from; its rules for unknown space are those of plans.
         chomp: the optimiser; its margin is set by the planner.
-        num_waypoints: of a plan.
+        num_waypoints: of a plan, at most.
+        spacing: between its waypoints [m], unless it would have more or less than `MIN_WAYPOINTS` of them.
         margin: clearance [m] that plans keep where the map has a route with as much.
         clearance_change: a plan is no longer good when the map has taken this much [m] of its clearance.
         off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
@@ -51,14 +58,18 @@ class BasePlannerConfig:
         default_factory=lambda: GridSearchConfig(
             through_blocked=30.0,
             through_unknown=2.0,
+            through_guessed=3.0,
             workspace=WorkspaceConfig(unknown_confidence=0.5),
         )
     )
     chomp: ChompConfig = field(
-        # Plans that succeed take 10 to 50 iterations; the others end as the searched route, and should do so soon.
-        default_factory=lambda: ChompConfig(eps=0.35, max_iterations=60, max_tightenings=1, restarts=0)
+        # Plans that succeed take 10 to 30 iterations; the others end as the searched route, and should do so soon.
+        default_factory=lambda: ChompConfig(
+            eps=0.35, descent=DescentConfig(polish=20), max_iterations=60, max_tightenings=1, restarts=0
+        )
     )
     num_waypoints: int = 40
+    spacing: float = 0.1
     margin: float = 0.05
     clearance_change: float = 0.05
     off_path: float = 0.25
@@ -71,20 +82,20 @@ class BasePlannerConfig:
 
     def __post_init__(self) -> None:
         refuse_nan(self)
-        positive = (self.clearance_change, self.off_path, self.memory, self.room)
+        positive = (self.spacing, self.clearance_change, self.off_path, self.memory, self.room)
         good = (
             all(value > 0 for value in positive)
             and self.stand_off >= 0
             and self.wary >= 0
-            and self.num_waypoints >= 3
+            and self.num_waypoints >= MIN_WAYPOINTS
             and min(self.looks, self.looks_came) >= 1
             and self.margin >= self.search.least_margin
         )
         if not good:
             raise ConfigError(
-                "BasePlannerConfig: clearance_change, off_path, memory and room must be positive, stand_off and "
-                "wary not negative, num_waypoints at least 3, looks and looks_came at least 1 and margin at least "
-                f"search.least_margin, got {self}."
+                "BasePlannerConfig: spacing, clearance_change, off_path, memory and room must be positive, stand_off "
+                f"and wary not negative, num_waypoints at least {MIN_WAYPOINTS}, looks and looks_came at least 1 and "
+                f"margin at least search.least_margin, got {self}."
             )
 
 
@@ -243,7 +254,7 @@ class BasePlanner:
         # Where the robot stands too close already, only the search knows where it may be as close again.
         if start.clearance >= config.search.least_margin:
             chomp = Chomp(self.body, replace(config.chomp, validation=validation), self.seed)
-            guess = Trajectory.through(route.path, config.num_waypoints) if len(path) > 1 else path
+            guess = Trajectory.through(route.path, self._waypoints(route)) if len(path) > 1 else path
             result = chomp.optimise(guess, sdf)
             if result.success and self._stays_in_seen_space(result.trajectory, sdf):
                 return result
@@ -251,6 +262,11 @@ class BasePlanner:
         message = f"the searched route: {verdict.message}"
         seconds = time.perf_counter() - began
         return PlanResult(path, verdict.status, message, verdict.clearance, (), 0, seconds)
+
+    def _waypoints(self, route: Route) -> int:
+        """How many waypoints a plan along a route has."""
+        length = float(route.path.diff(dim=0).norm(dim=1).sum())
+        return min(self.config.num_waypoints, max(MIN_WAYPOINTS, math.ceil(length / self.config.spacing) + 1))
 
     def _stays_in_seen_space(self, path: Trajectory, sdf: DistanceField) -> bool:
         """Whether a path enters no unknown space, by the rules of the search."""

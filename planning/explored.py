@@ -84,6 +84,13 @@ class ExploredField:
             return torch.zeros(points.shape[:-1], dtype=torch.bool)
         return self._came(points, *self.field.distance_and_gradient(points))
 
+    def surface_seen(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """At which points [m] the nearest surface was seen; at all in fields that do not tell how sure they are."""
+        if not isinstance(self.field, ConfidentField):
+            return torch.ones(points.shape[:-1], dtype=torch.bool)
+        distance, gradient = self.field.distance_and_gradient(points)
+        return self.field.confidence(points.detach() - distance.unsqueeze(-1) * gradient) >= SEEN
+
     @property
     def _is_wary(self) -> bool:
         return self.wary > 0 and isinstance(self.field, ChangingField)

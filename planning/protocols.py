@@ -56,6 +56,15 @@ class ChangingField(DistanceField, Protocol):
 
 
 @runtime_checkable
+class SurveyedField(DistanceField, Protocol):
+    """A distance field that tells surfaces that were seen from those that it guesses."""
+
+    def surface_seen(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether the surface nearest to points [m] was seen."""
+        ...
+
+
+@runtime_checkable
 class CostField(Protocol):
     """An obstacle cost c(f(x) - r) over a distance field f, as in CHOMP (Zucker et al. 2013, section 3.2)."""
 

@@ -208,11 +208,12 @@ class ReplanningLoop:
             if frame is None:
                 return
             try:
+                # Before the frame, so that one refresh of the map serves both.
+                if self._mapped and self.footprint and isinstance(self.mapper, FootprintMap):
+                    self.mapper.clear_footprint(*self.footprint())
                 self.mapper.integrate(frame)
                 self.report.frames += 1
                 self._mapped = True
-                if self.footprint and isinstance(self.mapper, FootprintMap):
-                    self.mapper.clear_footprint(*self.footprint())
             except ValueError as error:
                 logger.warning("frame passed over: %s", error)
                 self.report.frames_refused += 1

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from planning.bystanders import REACH, bystanders
 from planning.gaze import Gaze, GazeConfig
-from planning.grid_search import GridSearchConfig
+from planning.position_costs import GridSearchConfig
 from planning.protocols import ChangingField
 from tests.planning.fields import AutogradField, Cylinder, Union
 from tests.planning.test_replanning import FREE, QUICK, drive

@@ -15,8 +15,9 @@ from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.drive import DriveStatus
 from planning.explored import ExploredField, Trodden
 from planning.gaze import Gaze, GazeConfig
-from planning.grid_search import GridSearchConfig, grid_search
-from planning.protocols import ChangingField, ObservingField
+from planning.grid_search import grid_search
+from planning.position_costs import GridSearchConfig
+from planning.protocols import ChangingField, ObservingField, SurveyedField
 from planning.replanning import ReplanningLoop
 from planning.trajectory import Trajectory
 from planning.workspace import WorkspaceConfig
@@ -70,6 +71,16 @@ def test_known_is_what_was_looked_at_and_where_the_base_has_been() -> None:
 def test_a_confidence_tells_as_well_what_was_looked_at() -> None:
     explored = ExploredField(Confident(FREE, 2.0), trodden(*TRAIL))
     assert explored.confidence(torch.tensor([[1.9, 3.0, 0.0], [2.1, 3.0, 0.0]])).tolist() == [1, 0]
+
+
+def test_a_surface_was_seen_where_the_field_is_sure_of_it_wherever_one_asks() -> None:
+    walls = Union(Box((1.0, 0.0, 0.5), (0.05, 9.0, 9.0)), Box((3.0, 0.0, 0.5), (0.05, 9.0, 9.0)))
+    at = torch.tensor([[0.3, 0.0, 0.5], [1.8, 0.0, 0.5], [2.2, 0.0, 0.5], [3.0, 0.0, 0.5]])
+    sure, telling = ExploredField(Confident(walls, 2.0), Trodden()), Observed(walls, torch.zeros(1, 2), 1.0)
+    assert isinstance(sure, SurveyedField)
+    assert sure.surface_seen(at).tolist() == [True, True, False, False]
+    assert sure.surface_seen(at.view(2, 2, 3)).shape == (2, 2)
+    assert ExploredField(telling, Trodden()).surface_seen(at).all(), "it does not tell how sure it is"
 
 
 @pytest.mark.parametrize("seen", [Observed(FREE, torch.zeros(1, 2), 1.0), Confident(FREE, 1.0)])

@@ -10,7 +10,7 @@ import pytest
 from planning.drive import DriveStatus
 from planning.errors import ConfigError
 from planning.giving_way import GivingWay, length_left, path_length
-from planning.grid_search import GridSearchConfig
+from planning.position_costs import GridSearchConfig
 from planning.replanning import ReplanningConfig
 from tests.planning.fields import Box, Union
 from tests.planning.test_replanning import FREE, GOAL, QUICK, drive, places

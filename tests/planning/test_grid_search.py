@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from planning import ConfigError, Trajectory, TrajectoryError, Validation, WorkspaceConfig, check
-from planning.grid_search import GridSearchConfig, Route, grid_search
+from planning.grid_search import Route, grid_search
+from planning.position_costs import GridSearchConfig
 from tests.planning.fields import (
     Box,
     Confident,
@@ -216,6 +217,7 @@ def test_a_goal_that_is_no_place_is_refused(bad: float) -> None:
         {"caution": 0.5},
         {"through_passing": 0.5},
         {"through_passing": math.nan},
+        {"through_guessed": 0.5},
     ],
 )
 def test_bad_settings_are_refused(values: dict) -> None:
@@ -262,6 +264,31 @@ def test_a_free_way_is_never_given_up_for_a_shorter_blocked_one() -> None:
     wall = Box((1.5, 0.0, 0.5), (0.1, 2.0, 1.0))
     route = grid_search(ROBOT, wall, START, GOAL, replace(EXPLORING, through_blocked=1.0))
     assert route.reaches_goal and checked(route, wall).clearance > 0
+
+
+# A wall that was seen, and what the field guesses beyond its end: solid, too, and thick.
+SEEN_WALL, GUESSED = Box((1.5, 0.0, 0.5), (0.1, 2.0, 1.0)), Box((1.5, 4.2, 0.5), (0.4, 2.2, 1.0))
+
+
+class Surveyed(Union):
+    """It knows that it only guesses one of its parts."""
+
+    def surface_seen(self, points: torch.Tensor) -> torch.Tensor:
+        return SEEN_WALL.distance(points) < GUESSED.distance(points)
+
+
+@pytest.mark.parametrize(("price", "guessed"), [(3.0, True), (30.0, False), (math.inf, False)])
+def test_to_go_and_see_what_is_guessed_is_worth_a_detour(price: float, guessed: bool) -> None:
+    below = Box((1.5, -7.0, 0.5), (0.1, 5.5, 1.0))
+    field = Surveyed(SEEN_WALL, below, GUESSED)
+    route = grid_search(ROBOT, field, START, GOAL, replace(EXPLORING, through_guessed=price))
+    assert not route.reaches_goal and route.entry is not None
+    assert checked(route, field).clearance > -0.03
+    assert (float(route.entry[1]) > 1.5) == guessed, "a guess costs no more than a wall"
+    blind = grid_search(
+        ROBOT, Union(SEEN_WALL, below, GUESSED), START, GOAL, replace(EXPLORING, through_guessed=price)
+    )
+    assert abs(float(blind.entry[1])) < 1.0, "fields that do not tell are taken at their word"
 
 
 # A wall with a passage on the way, in which somebody stands, and a way round its end.

@@ -11,8 +11,9 @@ import torch
 
 from planning.base_planner import BasePlanner, BasePlannerConfig
 from planning.drive import DriveStatus
-from planning.grid_search import GridSearchConfig, grid_search
+from planning.grid_search import grid_search
 from planning.once_free import OnceFree
+from planning.position_costs import GridSearchConfig
 from tests.planning.fields import Box, Cylinder, Union
 from tests.planning.test_replanning import BODY, FREE, QUICK, drive
 from tests.planning.unicycles import Unicycle
