@@ -98,16 +98,21 @@ def position_costs(
     workspace = Workspace(robot, sdf, eps=1.0, config=config.workspace)
     away = (positions - start).norm(dim=1)
     here = int(away.argmin())
-    found = _by_a_few(robot, workspace, positions, config.least_margin)
+    body = _Body(*robot.spheres(positions[here]), positions[here])
+    found = _by_a_few(body, workspace, positions, config.least_margin)
     unknown = torch.zeros(len(positions), dtype=torch.bool)
-    # What a few spheres find blocked is blocked, and need not be known better, except where the robot may escape.
-    more = (found.clearance >= config.least_margin) | (away <= config.escape)
-    for block in more.nonzero()[:, 0].split(500):
-        centres, radii = robot.spheres(positions[block])
-        found.take(block, workspace, centres, radii, workspace.clearance(centres, radii), config.least_margin)
+    # What a few spheres find blocked is blocked, and what is unknown is but guessed to be free: neither need be known
+    # better, except where the robot may escape.
+    near = away <= config.escape
+    for block in ((found.clearance >= config.least_margin) | near).nonzero()[:, 0].split(500):
+        centres = body.at(positions[block])
         hidden = workspace.unknown(centres)
         if hidden is not None:
             unknown[block] = hidden.any(dim=-1)
+            closer = ~unknown[block] | near[block]
+            block, centres = block[closer], centres[closer]
+        clearance = workspace.clearance(centres, body.radii)
+        found.take(block, workspace, centres, body.radii, clearance, config.least_margin)
     clearance = found.clearance
     short = ((config.margin - clearance) / (config.margin - config.least_margin)).clamp(min=0.0)
     escape = (away <= config.escape) & (clearance >= clearance[here]) & (unknown <= unknown[here])
@@ -124,6 +129,28 @@ def position_costs(
         waiting[gone] = price[gone] = config.through_passing
         open_ |= gone
     return PositionCosts(cost, waiting, price, open_)
+
+
+class _Body(NamedTuple):
+    """The spheres of a robot with q = (x, y), which moves them along.
+
+    Args:
+        centres: where it is at a position [m].
+        radii: [m].
+        position: which.
+    """
+
+    centres: Float[Tensor, "s 3"]
+    radii: Float[Tensor, " s"]
+    position: Float[Tensor, "2"]
+
+    def at(self, positions: Float[Tensor, "m 2"]) -> Float[Tensor, "m s 3"]:
+        """The centres [m] at other positions."""
+        return self.centres + torch.nn.functional.pad(positions - self.position, (0, 1))[:, None]
+
+    def some(self, which: Int[Tensor, " few"]) -> _Body:
+        """A part of the spheres."""
+        return _Body(self.centres[which], self.radii[which], self.position)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,22 +190,20 @@ class _Found:
         self.seen[rows] = seen.any(dim=-1)
 
 
-def _by_a_few(
-    robot: SphereRobot, workspace: Workspace, positions: Float[Tensor, "n 2"], least: float
-) -> _Found:
+def _by_a_few(body: _Body, workspace: Workspace, positions: Float[Tensor, "n 2"], least: float) -> _Found:
     """What is found by every eighth sphere that may not touch the floor."""
-    n, spheres = len(positions), robot.spheres(positions[:1])[1]
+    n = len(positions)
     found = _Found(
         torch.full((n,), torch.inf, dtype=positions.dtype),
         torch.zeros((n, 3), dtype=positions.dtype),
         torch.zeros(n, dtype=torch.bool),
     )
-    few = torch.arange(len(spheres))
+    which = torch.arange(len(body.radii))
     if workspace.floor is not None:
-        few = few[~workspace.floor]
-    few = few[::8]
-    for block in torch.arange(n).split(2000) if len(few) else ():
-        centres, radii = robot.spheres(positions[block])
-        centres, radii = centres[:, few], radii[few]
-        found.take(block, workspace, centres, radii, workspace.field.distance(centres) - radii, least)
+        which = which[~workspace.floor]
+    few = body.some(which[::8])
+    for block in torch.arange(n).split(2000) if len(few.radii) else ():
+        centres = few.at(positions[block])
+        clearance = workspace.field.distance(centres) - few.radii
+        found.take(block, workspace, centres, few.radii, clearance, least)
     return found
