@@ -115,7 +115,7 @@ def position_costs(
         found.take(block, workspace, centres, body.radii, clearance, config.least_margin)
     clearance = found.clearance
     short = ((config.margin - clearance) / (config.margin - config.least_margin)).clamp(min=0.0)
-    escape = (away <= config.escape) & (clearance >= clearance[here]) & (unknown <= unknown[here])
+    escape = near & (clearance >= clearance[here]) & (unknown <= unknown[here])
     solid = ~(clearance >= config.least_margin) & ~escape  # NaN is blocked
     unknown &= ~escape
     price = (1 + (config.caution - 1) * short).masked_fill(solid, config.through_blocked)
@@ -160,7 +160,8 @@ class _Found:
     Args:
         clearance: the least of any sphere [m].
         deepest: that sphere's centre [m].
-        seen: whether a surface that was seen cuts into a sphere, and not only one that the field guesses.
+        seen: whether a surface that was seen cuts into a sphere, and not only one that the field guesses; or the field
+            is NaN.
     """
 
     clearance: Float[Tensor, "n"]
@@ -187,7 +188,7 @@ class _Found:
         seen = torch.zeros_like(cut)
         if cut.any():
             seen[cut] = workspace.field.surface_seen(centres[cut])
-        self.seen[rows] = seen.any(dim=-1)
+        self.seen[rows] = seen.any(dim=-1) | self.clearance[rows].isnan()
 
 
 def _by_a_few(body: _Body, workspace: Workspace, positions: Float[Tensor, "n 2"], least: float) -> _Found:

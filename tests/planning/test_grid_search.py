@@ -10,7 +10,7 @@ import torch
 
 from planning import ConfigError, Trajectory, TrajectoryError, Validation, WorkspaceConfig, check
 from planning.grid_search import Route, grid_search
-from planning.position_costs import GridSearchConfig
+from planning.position_costs import GridSearchConfig, position_costs
 from tests.planning.fields import (
     Box,
     Confident,
@@ -289,6 +289,16 @@ def test_to_go_and_see_what_is_guessed_is_worth_a_detour(price: float, guessed: 
         ROBOT, Union(SEEN_WALL, below, GUESSED), START, GOAL, replace(EXPLORING, through_guessed=price)
     )
     assert abs(float(blind.entry[1])) < 1.0, "fields that do not tell are taken at their word"
+
+
+def test_where_a_field_is_nan_it_guesses_nothing() -> None:
+    class Broken(Union):
+        def surface_seen(self, points: torch.Tensor) -> torch.Tensor:
+            return torch.ones(points.shape[:-1], dtype=torch.bool)
+
+    config, at = replace(EXPLORING, through_guessed=3.0), torch.tensor([[0.0, 0.0], [2.0, 0.0]])
+    prices = position_costs(ROBOT, Broken(NanBeyond(FREE, 1.5)), at, START, config, None).price
+    assert float(prices[0]) == 1.0 and float(prices[1]) == config.through_blocked
 
 
 # A wall with a passage on the way, in which somebody stands, and a way round its end.
