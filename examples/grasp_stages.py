@@ -24,7 +24,7 @@ from examples.arm import (
 )
 from examples.episode import Episode
 from isdf.field import grid_points
-from planning.clock import Clock
+from planning.clock import Clock, FootprintMap
 from planning.grasping import find_grasps
 from planning.object_surface import object_surface
 from planning.protocols import DistanceField
@@ -51,6 +51,8 @@ SPACING = 0.03
 """Of the baked map that the arm plans in [m]."""
 AROUND = 0.03
 """The robot has at least so much room about it where it stands [m]: it drove there."""
+TORSO_STEPS = 12
+"""Heights of the torso that stand for all."""
 PLANS = 4
 """So many of the best grasps are planned to."""
 
@@ -100,6 +102,8 @@ class CloseLook:
         frame = robot.observe()
         if frame is None or not frame.depth.any():
             return
+        if isinstance(mapper, FootprintMap):
+            mapper.clear_footprint(*self.episode.spheres())
         near = only_near(frame, self.point)
         views = [(mapper, frame), *([(self.mapper, near)] if near.depth.any() else [])]
         spent = sum(self.clock.charge(partial(taking.integrate, view))[1] for taking, view in views)
@@ -190,15 +194,15 @@ def field_for_reaching(episode: Episode) -> DistanceField:
 
 
 def own_space(episode: Episode) -> tuple[torch.Tensor, torch.Tensor]:
-    """Balls (n, 3), (n,) [m] in which the robot is, or will be when its torso rises: its camera never sees them."""
+    """Balls (n, 3), (n,) [m] in which the robot is, or its torso when it rises or sinks: its camera never sees them."""
     model = episode.model
-    q = torch.as_tensor(episode.robot.posture(), dtype=torch.float32).repeat(5, 1)
+    q = torch.as_tensor(episode.robot.posture(), dtype=torch.float32).repeat(1 + TORSO_STEPS, 1)
     lift = model.joint_names.index(LIFT)
-    q[1:, lift] = torch.linspace(float(q[0, lift]), float(model.joint_limits[lift, 1]), 4)
+    q[1:, lift] = torch.linspace(*model.joint_limits[lift].tolist(), TORSO_STEPS)
     centres, radii = model.spheres(q)
     rising = torch.tensor([link.startswith("torso") for link in model.sphere_links])
     risen = centres[1:, rising].reshape(-1, 3)
-    return torch.cat([centres[0], risen]), torch.cat([radii, radii[rising].repeat(4)])
+    return torch.cat([centres[0], risen]), torch.cat([radii, radii[rising].repeat(TORSO_STEPS)])
 
 
 def take(

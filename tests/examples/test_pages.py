@@ -143,7 +143,7 @@ def test_07_maps_from_a_live_camera(tmp_path, capsys) -> None:
 
 @pytest.mark.slow
 def test_08_drives(tmp_path, capsys) -> None:
-    options = e08_navigate.Drive(tmp_path / "out", "office", 1, fixed_cost=True, time_limit=60.0)
+    options = e08_navigate.Drive(tmp_path / "out", "office", 1, fixed_cost=True, time_limit=120.0)
     report = e08_navigate.main(options)
     assert report.status is DriveStatus.REACHED and report.plans >= 1 and report.path_length > 0.5
     assert "contacts: none" in capsys.readouterr().out
