@@ -7,10 +7,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from examples import grasp
 from examples.episode import Episode, EpisodeOptions
-from examples.grasp_stages import LIFT, draw_back, heights_to_look_from, holds_nothing, raise_torso
+from examples.grasp_stages import (
+    LIFT,
+    draw_back,
+    heights_to_look_from,
+    holds_nothing,
+    own_space,
+    raise_torso,
+)
 from robots.simulation import make_scene
 
 
@@ -69,6 +77,13 @@ def test_the_hand_feels_itself_and_the_arm_draws_back(tmp_path: Path) -> None:
     assert heights[0] == pytest.approx(tucked[lift], abs=0.005) and np.all(np.diff(heights) > 0.02)
     raise_torso(episode, heights[-1])
     assert robot.posture()[lift] == pytest.approx(heights[-1], abs=0.005)
+    lower = torch.as_tensor(robot.posture(), dtype=torch.float32).repeat(9, 1)
+    lower[:, lift] = torch.linspace(float(tucked[lift]), heights[-1], 9)
+    balls, sizes = episode.model.spheres(lower)
+    torso = torch.tensor([link.startswith("torso") for link in episode.model.sphere_links])
+    centres, radii = own_space(episode)
+    deep = (radii - torch.cdist(balls[:, torso].reshape(-1, 3), centres)).amax(dim=1)
+    assert bool((deep > sizes[torso].repeat(9) - 0.02).all()), "it may sink again"
     assert not holds_nothing(episode)
     robot.world.command_gripper(0.0, 30.0)
     robot.wait(1.0)
