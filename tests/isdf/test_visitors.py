@@ -2,6 +2,7 @@
 
 import functools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,10 +32,16 @@ def watch(mapper, at, seconds, place=None, height=1.2):
     start = mapper.frames_seen / FPS
     for n in range(round(seconds * FPS)):
         where = place(n / (seconds * FPS)) if callable(place) else place
-        room = furnished_room() if where is None else union(furnished_room(), person(*where, height))
         # A camera never gives the same image twice.
         eye = (EYE[0] + 0.02 * (n % 3), *EYE[1:])
-        mapper.integrate(render(room, look_at(eye, at), CAMERA, start + n / FPS))
+        mapper.integrate(replace(seen(eye, at, where, height), time=start + n / FPS))
+
+
+@functools.lru_cache(maxsize=64)
+def seen(eye, at, where, height):
+    """An image from an eye towards a place; somebody may stand in it."""
+    room = furnished_room() if where is None else union(furnished_room(), person(*where, height))
+    return render(room, look_at(eye, at), CAMERA)
 
 
 def around(x, y):
