@@ -76,7 +76,7 @@ def test_a_confidence_tells_as_well_what_was_looked_at() -> None:
 def test_a_surface_was_seen_where_the_field_is_sure_of_it_wherever_one_asks() -> None:
     walls = Union(Box((1.0, 0.0, 0.5), (0.05, 9.0, 9.0)), Box((3.0, 0.0, 0.5), (0.05, 9.0, 9.0)))
     at = torch.tensor([[0.3, 0.0, 0.5], [1.8, 0.0, 0.5], [2.2, 0.0, 0.5], [3.0, 0.0, 0.5]])
-    sure, telling = ExploredField(Confident(walls, 2.0), Trodden()), Observed(walls, torch.zeros(1, 2), 1.0)
+    sure, telling = ExploredField(Confident(walls, 1.5), Trodden()), Observed(walls, torch.zeros(1, 2), 1.0)
     assert isinstance(sure, SurveyedField)
     assert sure.surface_seen(at).tolist() == [True, True, False, False]
     assert sure.surface_seen(at.view(2, 2, 3)).shape == (2, 2)
