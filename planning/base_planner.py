@@ -14,6 +14,7 @@ from planning.chomp import Chomp, ChompConfig
 from planning.descent import DescentConfig
 from planning.errors import ConfigError
 from planning.explored import ExploredField, Trodden
+from planning.giving_way import path_length
 from planning.grid_search import Route, grid_search
 from planning.numbers import refuse_nan
 from planning.once_free import OnceFree
@@ -26,7 +27,7 @@ from planning.vain_looks import VainLooks
 from planning.validation import check
 from planning.workspace import Workspace, WorkspaceConfig
 
-# Of however short a plan.
+# Waypoints of a plan, however short, if it may have as many.
 MIN_WAYPOINTS = 12
 
 
@@ -38,7 +39,7 @@ class BasePlannerConfig:
         search: finds the route that CHOMP starts from; its rules for unknown space are those of plans.
         chomp: the optimiser; its margin is set by the planner.
         num_waypoints: of a plan, at most.
-        spacing: between its waypoints [m], unless it would have more or less than `MIN_WAYPOINTS` of them.
+        spacing: between its waypoints [m], closer where it would have less than a dozen.
         margin: clearance [m] that plans keep where the map has a route with as much.
         clearance_change: a plan is no longer good when the map has taken this much [m] of its clearance.
         off_path: nor when the base is this far [m] from it, for it was pushed or its wheels slipped.
@@ -87,15 +88,15 @@ class BasePlannerConfig:
             all(value > 0 for value in positive)
             and self.stand_off >= 0
             and self.wary >= 0
-            and self.num_waypoints >= MIN_WAYPOINTS
+            and self.num_waypoints >= 3
             and min(self.looks, self.looks_came) >= 1
             and self.margin >= self.search.least_margin
         )
         if not good:
             raise ConfigError(
                 "BasePlannerConfig: spacing, clearance_change, off_path, memory and room must be positive, stand_off "
-                f"and wary not negative, num_waypoints at least {MIN_WAYPOINTS}, looks and looks_came at least 1 and "
-                f"margin at least search.least_margin, got {self}."
+                "and wary not negative, num_waypoints at least 3, looks and looks_came at least 1 and margin at least "
+                f"search.least_margin, got {self}."
             )
 
 
@@ -265,8 +266,8 @@ class BasePlanner:
 
     def _waypoints(self, route: Route) -> int:
         """How many waypoints a plan along a route has."""
-        length = float(route.path.diff(dim=0).norm(dim=1).sum())
-        return min(self.config.num_waypoints, max(MIN_WAYPOINTS, math.ceil(length / self.config.spacing) + 1))
+        steps = math.ceil(path_length(route.path.numpy()) / self.config.spacing)
+        return min(self.config.num_waypoints, max(MIN_WAYPOINTS, steps + 1))
 
     def _stays_in_seen_space(self, path: Trajectory, sdf: DistanceField) -> bool:
         """Whether a path enters no unknown space, by the rules of the search."""

@@ -133,6 +133,15 @@ def test_the_way_leads_round_a_wall_that_was_seen_however_narrow_unseen_space_is
     assert float(wall.distance(torch.cat([way, torch.full((len(way), 1), 0.3)], dim=1)).min()) > 0.1
 
 
+@pytest.mark.parametrize(
+    ("far", "most", "waypoints"), [(0.6, 40, 12), (3.0, 40, 31), (9.0, 40, 40), (3.0, 5, 5)]
+)
+def test_a_plan_has_as_many_waypoints_as_its_length_asks_for(far: float, most: int, waypoints: int) -> None:
+    planner = BasePlanner(BODY, BasePlannerConfig(num_waypoints=most, spacing=0.1001))
+    plan = planner.plan(START, torch.tensor([far, 0.0]), FREE)
+    assert plan.reaches_goal and len(plan.result.trajectory) == waypoints
+
+
 def test_a_field_that_does_not_tell_is_taken_at_its_word() -> None:
     assert BasePlanner(BODY).plan(START, torch.tensor([3.0, 0.0]), FREE).reaches_goal
 

@@ -284,7 +284,14 @@ def test_bad_settings_are_refused(values: dict) -> None:
 
 @pytest.mark.parametrize(
     "values",
-    [{"clearance_change": 0.0}, {"off_path": 0.0}, {"num_waypoints": 2}, {"margin": -0.2}, {"looks": 0}],
+    [
+        {"clearance_change": 0.0},
+        {"off_path": 0.0},
+        {"num_waypoints": 2},
+        {"spacing": 0.0},
+        {"margin": -0.2},
+        {"looks": 0},
+    ],
 )
 def test_bad_planner_settings_are_refused(values: dict) -> None:
     with pytest.raises(ConfigError, match="BasePlannerConfig"):
