@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -88,7 +89,8 @@ def attempt(task: Task) -> None:
     try:
         report = task.run()
     except Exception as error:
-        report = {"success": False, "error": f"{type(error).__name__}: {error}"}
+        what = f"{type(error).__name__}: {error}"
+        report = {"success": False, "error": what, "traceback": traceback.format_exc()}
     finally:
         logging.disable(before)
     Path(task.folder).mkdir(parents=True, exist_ok=True)

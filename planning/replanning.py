@@ -276,7 +276,7 @@ class ReplanningLoop:
             self._failures = 0 if gone > PROGRESS else self._failures
             self._to_goal, self.report.message = fresh.reaches_goal, ""
             return fresh.result
-        self._give_up_plan(fresh.reason, fresh.came)
+        self._give_up_plan(fresh.reason, fresh.came, walks=fresh.blocker is not None)
         return None
 
     def _lets_pass(self, plan: PlanResult, route: Route) -> bool:
@@ -344,11 +344,14 @@ class ReplanningLoop:
         self._give_up_plan(f"the collision monitor held the base: {self.monitor.interventions.reason}")
         return True
 
-    def _give_up_plan(self, reason: str, came: bool = False) -> None:
-        """Stand without a plan until it is time for the next attempt."""
+    def _give_up_plan(self, reason: str, came: bool = False, walks: bool = False) -> None:
+        """Stand without a plan until it is time for the next attempt.
+
+        What came lately into the way and has not come to stay is no reason to call the goal unreachable.
+        """
         self.plan, self._held = None, 0.0
         self.giving_way.end()
-        self._failures += 1
+        self._failures += not walks
         self._failed_at = self.robot.base_state()[:2]
         self._came = came
         self._retry_at = self.robot.time + self._pause

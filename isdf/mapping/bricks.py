@@ -186,6 +186,37 @@ def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[np.float32, np.flo
     return bricks.distance[brick, at], bricks.weight[brick, at]
 
 
+# A view reaches this much farther [m] than the surfaces that are fused.
+BEYOND_BAND = 0.1
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def view_box(depth, noise, least, intrinsics, T_world_camera):
+    """Corners (2, 3) [m] of the box that holds a camera and all it sees, to the end of the truncation and a bit more.
+
+    Every pixel counts, for each may need a brick in the table. Arguments as for `missing_bricks`.
+    """
+    fx, fy, cx, cy = intrinsics
+    box = np.empty((2, 3))
+    box[0] = box[1] = T_world_camera[:3, 3]
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = np.float64(depth[v, u])
+            if z <= 0:
+                continue
+            z += max(least, noise * z * z) + BEYOND_BAND
+            a, b = (u - cx) / fx * z, (v - cy) / fy * z
+            for axis in range(3):
+                at = (
+                    T_world_camera[axis, 0] * a + T_world_camera[axis, 1] * b + T_world_camera[axis, 2] * z
+                    + T_world_camera[axis, 3]
+                )  # fmt: skip
+                box[0, axis] = min(box[0, axis], at)
+                box[1, axis] = max(box[1, axis], at)
+    return box
+
+
 @njit(cache=True, nogil=True)
 @no_type_check
 def missing_bricks(bricks: Bricks, depth, stride, noise, least, intrinsics, T_world_camera):

@@ -22,7 +22,7 @@ from ..errors import FrameError, NotReadyError
 from ..extent import grown, nothing_seen
 from ..frames import DepthFrame
 from .agreement import compare
-from .bricks import BrickVolume, missing_bricks
+from .bricks import BrickVolume, missing_bricks, view_box
 from .completion import load_network
 from .config import MapperConfig
 from .evidence import look_through
@@ -117,7 +117,7 @@ class Mapper(ShownMapper):
         if appeared is None:
             self._keep_up(T[:3, 3], frame.time)
             return
-        box = self._view(depth, T, frame)
+        box = view_box(depth, *self._band, _intrinsics(frame), T)
         self.bricks.include(box[0], box[1])
         bounds, up = grown(self._bounds, frame, self.config.max_depth), self.up - T[:3, 1]
         beyond = np.full(3, BEYOND_ACROSS)
@@ -271,22 +271,10 @@ class Mapper(ShownMapper):
         logger.warning("at %.2f s %s: a jump of the pose? passed over", frame.time, complaint)
         return None
 
-    def _view(
-        self, depth: Float[np.ndarray, "h w"], T: Float[np.ndarray, "4 4"], frame: DepthFrame
-    ) -> np.ndarray:
-        """Corners (2, 3) [m] of the box that holds the camera and all it sees, to the end of the truncation."""
-        stride = max(1, depth.shape[1] // COLUMNS)
-        v, u = (stride * index for index in np.nonzero(depth[::stride, ::stride]))
-        if len(v) == 0:  # what little there is lies between
-            v, u = np.nonzero(depth)
-        z = depth[v, u]
-        band = np.maximum(self.config.truncation, self.config.truncation_noise * z * z)
-        # The farthest pixel counts, whatever the stride: it decides whether every brick has a place in the table.
-        z = z + band + 0.1 + (depth.max() - z) * (z == z.max())
-        camera = frame.camera
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
-        points = (rays * z[:, None]) @ T[:3, :3].T + T[:3, 3]
-        return np.stack([np.minimum(points.min(axis=0), T[:3, 3]), np.maximum(points.max(axis=0), T[:3, 3])])
+    @property
+    def _band(self) -> tuple[float, float]:
+        """Truncation per squared depth, and the least of it [m]."""
+        return self.config.truncation_noise, self.config.truncation
 
     def _fuse(
         self,
@@ -298,7 +286,7 @@ class Mapper(ShownMapper):
         stride: int,
     ) -> None:
         config, bricks, lattice, intrinsics = self.config, self.bricks, self.lattice, _intrinsics(frame)
-        band = (config.truncation_noise, config.truncation)
+        band = self._band
         # At the far end of the range neighbouring rays are still closer than half a brick.
         sparse = max(1, int(4 * bricks.voxel * frame.camera.fx / config.max_depth))
         bricks.add(missing_bricks(bricks.arrays, depth, sparse, *band, intrinsics, T))

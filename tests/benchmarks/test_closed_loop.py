@@ -235,6 +235,7 @@ def test_results_are_kept_and_errors_are_results(
     assert asked == [0, 1, 2, 2], "what is there is not run again"
     assert [json.loads((f / "report.json").read_text())["task"]["number"] for f in folders] == [0, 1, 2]
     assert reports[1]["error"] == "RuntimeError: the simulator fell over"
+    assert "in pretend" in reports[1]["traceback"]
     text = (tmp_path / "summary.md").read_text()
     assert (
         "| 3 | 2 | 1 | 1.20 |" in text and "episode 1: RuntimeError" in text and "touched arm - table" in text

@@ -334,6 +334,21 @@ def test_the_command_line_maps_with_it_by_default(tmp_path, monkeypatch):
     )
 
 
+def test_what_one_pixel_sees_through_a_crack_has_its_place_in_the_map():
+    """Its bricks lie outside of the box of every other pixel's view, however few pixels are looked at."""
+    camera = PinholeCamera(144.0, 144.0, 79.5, 59.5, 160, 120)
+    for row, column in ((61, 3), (61, 157), (1, 81), (119, 81)):
+        mapper, depth = Mapper(), torch.full((120, 160), 1.0)
+        depth[40:44, 60:64], depth[row, column] = 9.0, 8.0
+        mapper.integrate(DepthFrame(depth, torch.eye(4), camera))
+        bricks = mapper.bricks
+        ray = np.array([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, 1.0])
+        places = np.linspace(7.95, 8.05, 9)[:, None] * ray
+        index = np.floor(places / (8 * bricks.voxel)).astype(int) - bricks.corner
+        assert (index >= 0).all() and (index < bricks.table.shape).all(), (row, column)
+        assert (bricks.table[tuple(index.T)] >= 0).any(), (row, column)
+
+
 def test_four_views_through_it_are_enough_for_what_has_gone():
     obstacle, mapper = box((-0.6, -0.9, 1.0), (0.3, 0.3, 0.5)), Mapper()  # hangs in mid-air, in full view
     now = watch(mapper, scene(obstacle), 0.0, 2.0)

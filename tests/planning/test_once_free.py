@@ -252,6 +252,16 @@ def test_what_came_and_stays_is_given_up() -> None:
     assert robot.state[0] < 1.7 - BODY.radius
 
 
+@pytest.mark.parametrize("came", [True, False])
+def test_a_goal_is_not_unreachable_because_somebody_walks_about_in_the_way(came: bool) -> None:
+    somebody = Knowing((2.0, 0.0, 0.5), (0.3, 1000.0, 1.0), since=1.0 if came else 3.0)
+    config = replace(QUICK, planner=BasePlannerConfig(), wait=1.0, time_limit=20.0)
+    _, report = drive(Unicycle(), somebody, config, goal=GOAL.double().numpy())
+    assert report.failed_plans > config.patience
+    assert report.status is (DriveStatus.TIME_LIMIT if came else DriveStatus.UNREACHABLE), report.message
+    assert not came or "something came into the way" in report.message
+
+
 @pytest.mark.parametrize(
     "values",
     [
