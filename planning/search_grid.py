@@ -45,13 +45,17 @@ class SearchGrid:
     def room(self, way: Float[Tensor, "m 2"], robot: Float[Tensor, "2"], apart: float) -> float:
         """Open area [m^2] that can be reached from a way [m] without coming nearer to a robot [m] than `apart` [m].
 
-        Of several areas that the way leads through the largest; inf if it is nowhere open and so far away.
+        Of several areas that the way leads through the largest; 0 if all that is open of it is nearer than that, inf if
+        it is nowhere open.
         """
+        cells = [self.nearest(place) for place in way]
+        if not self.open[cells].any():
+            return math.inf
         far = self.open & ((self.positions - robot).norm(dim=1) >= apart)
         regions, _ = label(far.numpy().reshape(self.shape))
-        on_way = regions.ravel()[[self.nearest(place) for place in way]]
-        sizes = np.bincount(regions.ravel())[on_way[on_way > 0]]
-        return float(sizes.max()) * self.spacing**2 if len(sizes) else math.inf
+        sizes = np.bincount(regions.ravel())
+        sizes[0] = 0  # what is nearer, or not open
+        return float(sizes[regions.ravel()[cells]].max()) * self.spacing**2
 
     def nearest_with_room(
         self, start: Float[Tensor, "2"], way: Float[Tensor, "m 2"], apart: float, area: float

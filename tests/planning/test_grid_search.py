@@ -343,7 +343,8 @@ def test_room_is_left_where_the_robot_stands_far_enough_aside() -> None:
     grid, way = route.grid, route.path
     assert 0.5 < grid.room(way, before, 1.0) < 3.0, "the corridor but for its mouth"
     assert grid.room(way, torch.tensor([-0.5, 0.0]), 1.0) > 20.0
-    assert grid.room(way[:3], before, 1.0) == math.inf
+    assert grid.room(way[:3], before, 1.0) == 0.0, "all of it is within a metre of the robot"
+    assert grid.room(torch.tensor([[3.0, 0.8]]), before, 1.0) == math.inf, "inside the wall"
     assert grid.room(torch.cat([way, torch.tensor([[4.0, 2.0]])]), before, 1.0) > 20.0, "the largest counts"
     path = grid.nearest_with_room(before, way, 1.0, 6.0)
     assert torch.equal(path[0], before) and grid.room(way, path[-1], 1.0) > 6.0

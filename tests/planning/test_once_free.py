@@ -171,6 +171,21 @@ def test_who_is_shut_in_by_the_robot_is_given_room_once(shut_in: bool) -> None:
     assert not planner.leads_on(planner.route(back, goal, occupied), 10.0) and planner.leads_on(far, 27.0)
 
 
+def test_who_stands_at_the_goal_beside_the_robot_is_given_room() -> None:
+    """In the dead end, where all that is left of the way is within a metre of the robot."""
+    planner, person = BasePlanner(BODY), Cylinder((2.95, 0.0), 0.3)
+    near, goal = torch.tensor([2.2, 0.0]), torch.tensor([2.8, 0.0])
+
+    class Met(Entered):
+        def came(self, points: torch.Tensor) -> torch.Tensor:
+            return person.distance(points).abs() < 0.1
+
+    planner.plan(near, goal, Met(NOOK))
+    plans = [planner.plan(near, goal, Met(NOOK, person), now=1.0 + n) for n in range(5)]
+    assert [plan.dead_end for plan in plans] == 4 * [True] + [False]
+    assert float((plans[-1].result.trajectory.waypoints[-1] - goal).norm()) > 1.3
+
+
 @pytest.mark.parametrize("shut_in", [True, False])
 def test_it_waits_where_it_shuts_in_nobody(shut_in: bool) -> None:
     walls = NOOK if shut_in else Union(*NOOK.parts[:2])
