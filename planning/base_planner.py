@@ -311,11 +311,17 @@ class BasePlanner:
     def _passing(
         self, sdf: DistanceField, places: Float[Tensor, "m 2"], deepest: Float[Tensor, "m 3"]
     ) -> Bool[Tensor, " m"]:
-        """Which blocked places were free before something came, as far as the field knows of that."""
-        out = torch.zeros(len(places), dtype=torch.bool)
-        if isinstance(sdf, ExploredField):
-            out = self._once_free.were(places)
-            out[out.clone()] = sdf.by_what_came(deepest[out])
+        """Which places are blocked by nothing but what came, as far as the field knows of that."""
+        if not isinstance(sdf, ExploredField):
+            return torch.zeros(len(places), dtype=torch.bool)
+        out = sdf.by_what_came(deepest)
+        if out.any():
+            workspace = Workspace(self.body, sdf, eps=1.0, config=self.config.search.workspace)
+            centres, radii = self.body.spheres(places[out])
+            cut = workspace.clearance(centres, radii) < self.config.search.least_margin
+            alone = ~cut
+            alone[cut] = sdf.by_what_came(centres[cut])
+            out[out.clone()] = alone.all(dim=1)
         return out
 
     def _has_come(self, route: Route, now: float) -> bool:

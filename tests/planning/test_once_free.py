@@ -15,6 +15,7 @@ from planning.grid_search import grid_search
 from planning.once_free import OnceFree
 from planning.position_costs import GridSearchConfig
 from tests.planning.fields import Box, Cylinder, Union
+from tests.planning.robots import Disc
 from tests.planning.test_replanning import BODY, FREE, QUICK, drive
 from tests.planning.unicycles import Unicycle
 
@@ -112,7 +113,7 @@ class Passage(Union):
     """The wall, perhaps with somebody in the passage; what is in the passage came there, or was always there."""
 
     def __init__(self, *parts, came: bool = False) -> None:
-        super().__init__(WALL, *parts)
+        super().__init__(*parts)
         self.came_there = came
 
     def observed(self, points: torch.Tensor) -> torch.Tensor:
@@ -129,12 +130,39 @@ def test_who_came_into_the_way_is_waited_for_though_there_is_a_way_round(came: b
     config = replace(config, search=replace(config.search, through_passing=1.5))
     planner, person = BasePlanner(BODY, config), Box((2.0, 0.0, 0.5), (0.2, 0.5, 1.0))
     if before:
-        assert planner.plan(START, GOAL, Passage()).reaches_goal
-    plan = planner.plan(START, GOAL, Passage(person, came=came), now=1.0)
-    assert plan.usable and plan.reaches_goal != (came and before)
-    if came and before:
+        assert planner.plan(START, GOAL, Passage(WALL)).reaches_goal
+    plan = planner.plan(START, GOAL, Passage(WALL, person, came=came), now=1.0)
+    assert plan.usable and plan.reaches_goal != came
+    if came:
         assert plan.blocker is not None and plan.came
-        torch.testing.assert_close(plan.blocker, torch.tensor([1.8, 0.0]), atol=0.3, rtol=0.0)
+        assert float(person.distance(torch.tensor([*plan.blocker.tolist(), 0.5])).abs()) < 0.1
+
+
+class Ring(Disc):
+    """A disc made of small spheres, which can be cut by several things."""
+
+    def spheres(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Twelve spheres on a circle and one in the middle."""
+        turns = torch.arange(12).to(q) * math.pi / 6
+        offsets = self.radius * torch.stack([turns.cos(), turns.sin(), 0 * turns], dim=1)
+        offsets = torch.cat([torch.zeros(1, 3).to(q), 0.75 * offsets])
+        middle, _ = super().spheres(q)
+        return middle + offsets, torch.full((13,), 0.25 * self.radius).to(q)
+
+
+@pytest.mark.parametrize("half_width", [0.15, 0.6])
+def test_who_stands_in_a_gap_too_narrow_for_the_base_is_not_waited_for(half_width: float) -> None:
+    jambs = [Box((2.0, y * (half_width + 0.8), 0.5), (0.1, 0.8, 1.0)) for y in (-1, 1)]
+    person = Box((2.0, 0.0, 0.5), (0.3, 0.14, 1.0))
+
+    class Gap(Passage):
+        def came(self, points: torch.Tensor) -> torch.Tensor:
+            return person.distance(points).abs() < 0.005
+
+    config = BasePlannerConfig()
+    config = replace(config, search=replace(config.search, through_passing=1.5))
+    plan = BasePlanner(Ring(radius=0.25), config).plan(START, GOAL, Gap(*jambs, person))
+    assert plan.usable and plan.came == (not plan.reaches_goal) == (half_width > 0.3)
 
 
 # A dead end 1.6 m wide that opens at x = 1, and somebody in its mouth.
