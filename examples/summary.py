@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from examples.episode import Episode
 from examples.pictures import draw_grasp, draw_map
 from isdf.viewer.pictures import depth_picture
 from planning.protocols import DistanceField
-from robots.simulation import DepthFrame
+from robots.simulation import DepthFrame, SceneField
 
 MOMENTS = 150
 """At most so many postures of an episode are looked at."""
@@ -76,19 +79,60 @@ def grasp_summary(
     figure.savefig(path, dpi=100)
 
 
-def draw_clearance(axes: Axes, episode: Episode, truth: DistanceField | None) -> None:
+def draw_clearance(axes: Axes, episode: Episode, truth: SceneField | None) -> None:
     """Least distance of the robot's spheres from things over time: in truth but for the floor, else in the last map."""
-    times, postures = _states(episode)
-    centres, radii = episode.model.spheres(torch.as_tensor(postures, dtype=torch.float32))
+    recording = episode.robot.recording
+    times, postures = recording.postures()
+    some = slice(None, None, max(1, len(times) // MOMENTS))
+    centres, radii = episode.model.spheres(torch.as_tensor(postures[some], dtype=torch.float32))
     off_floor = ~episode.model.floor_spheres
-    field, label = (episode.mapper.field(), "in the last map") if truth is None else (truth, "in truth")
-    clear = (field.distance(centres[:, off_floor]) - radii[off_floor]).amin(dim=1).numpy()
+    centres, radii, times = centres[:, off_floor], radii[off_floor], times[some]
+    if truth is None:
+        field, label = episode.mapper.field(), "in the last map"
+        clear = (field.distance(centres) - radii).amin(dim=1).numpy()
+    else:
+        clear, label = (
+            clearances(truth, centres, radii, recording.movers, recording.object_poses()[some]),
+            "in truth",
+        )
     axes.plot(times, 100 * clear, label=f"{label}: least {100 * clear.min():.0f} cm")
     axes.axhline(0.0, color="black", linewidth=1.0)
     axes.axhspan(0.0, 100 * LEAST, color="0.9")
     axes.set(xlabel="time [s]", ylabel="clearance [cm]", title="how near the robot came to things")
     axes.set_ylim(bottom=min(-2.0, axes.get_ylim()[0]))
     axes.legend(fontsize=8)
+
+
+def clearances(
+    truth: SceneField,
+    centres: Float[Tensor, "n s 3"],
+    radii: Float[Tensor, " s"],
+    movers: Sequence[str],
+    poses: Float[np.ndarray, "n k 4 4"],
+) -> Float[np.ndarray, " n"]:
+    """Least distance [m] of spheres from what is in a scene, at each moment from movers where they were then.
+
+    Args:
+        truth: the scene.
+        centres: of the spheres at each moment [m].
+        radii: [m].
+        movers: names of what moved; those that are not in the scene do not count.
+        poses: of the movers at each moment, NaN while they were not there.
+    """
+    moving = {name for name in movers if name in truth.names}
+    clear = torch.full((len(centres),), torch.inf)
+    if set(truth.names) - moving:
+        clear = (truth.without(moving).distance(centres) - radii).amin(dim=1)
+    for n, now in enumerate(poses):
+        there = {
+            name: pose
+            for name, pose in zip(movers, now, strict=True)
+            if name in moving and np.isfinite(pose).all()
+        }
+        if there:
+            field = truth.without(set(truth.names) - set(there)).at_poses(there)
+            clear[n] = torch.minimum(clear[n], (field.distance(centres[n]) - radii).amin())
+    return clear.numpy()
 
 
 def draw_click(axes: Axes, frame: DepthFrame, point: np.ndarray) -> None:
@@ -122,15 +166,8 @@ def _begun(headline: str, panels: int) -> tuple[Figure, list[Axes]]:
     return figure, list(figure.subplots(1, panels))
 
 
-def _truth_without_floor(episode: Episode) -> DistanceField | None:
+def _truth_without_floor(episode: Episode) -> SceneField | None:
     if not episode.world.solids or episode.scene.urdf_path is not None:
         return None
     field = episode.world.field()
     return field.without({"floor"} & set(field.names))
-
-
-def _states(episode: Episode) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) [s] and postures (n, dof), at most `MOMENTS` of them."""
-    times, postures = episode.robot.recording.postures()
-    stride = max(1, len(times) // MOMENTS)
-    return times[::stride], postures[::stride]

@@ -137,6 +137,8 @@ class BasePlan:
 # Something has come where so many positions, into what is blocked now, were free: the edges of walls shift with every
 # image.
 DEEP = 4
+# From the side of somebody that is seen to his middle [m].
+HALF_AS_WIDE = 0.2
 # A way leads on if the base gets that much farther on it [m].
 FREE = 0.5
 
@@ -198,7 +200,7 @@ class BasePlanner:
         blocker = self._blocker(route, explored)
         came = blocker is not None or self._has_come(route, now)
         if route.entry is not None:
-            route = self._to_wait_at(route, now) if came else self._to_look_from(route, now)
+            route = self._to_wait_at(route, blocker, now) if came else self._to_look_from(route, now)
         result = self._optimised(route, explored)
         dead_end = result.success and not route.reaches_goal and self._leads_nowhere(route, goal)
         if dead_end and route.entry is not None:
@@ -219,11 +221,11 @@ class BasePlanner:
         self._once_free.add(route.grid.free)
         return route
 
-    def leads_on(self, route: Route, now: float = 0.0) -> bool:
+    def leads_on(self, route: Route, sdf: DistanceField, now: float = 0.0) -> bool:
         """Whether a way that was blocked by what came is free by now [s], all of it or the next part."""
         if route.entry is None:
             return route.reaches_goal
-        path = self._to_wait_at(route, now).path
+        path = self._to_wait_at(route, self._blocker(route, self._explored(sdf)), now).path
         return float((path[-1] - path[0]).norm()) > FREE
 
     def still_good(self, plan: PlanResult, position: Float[Tensor, "2"], sdf: DistanceField) -> bool:
@@ -297,16 +299,20 @@ class BasePlanner:
             return replace(route, path=back)
         return _until(route, self.config.stand_off)
 
-    def _to_wait_at(self, route: Route, now: float) -> Route:
+    def _to_wait_at(self, route: Route, blocker: Float[Tensor, "2"] | None, now: float) -> Route:
         """The part of a route that leads to where it waits for what came into the way.
 
         It stands off from the first, and where it does not stand in the way of what came; but it backs off only after a
         while: what came may walk on at once, and who backs off has to turn away and back again.
         """
-        if self._looks.makes_room(route, now):
-            return replace(route, path=self._looks.out_of_the_way(route))
+        whom = route.onward
+        if blocker is not None:
+            off = blocker - route.path[0]
+            whom = (blocker + HALF_AS_WIDE / off.norm().clamp_min(1e-6) * off)[None]
+        if self._looks.makes_room(route, whom, now):
+            return replace(route, path=self._looks.out_of_the_way(route, whom))
         near = _until(route, self.config.stand_off)
-        return replace(near, path=self._looks.not_in_the_way(near))
+        return replace(near, path=self._looks.not_in_the_way(near, whom))
 
     def _passing(
         self, sdf: DistanceField, places: Float[Tensor, "m 2"], deepest: Float[Tensor, "m 3"]

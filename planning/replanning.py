@@ -250,7 +250,7 @@ class ReplanningLoop:
         start = torch.as_tensor(self.robot.base_state()[:2], dtype=torch.float32)
         end = torch.as_tensor(goal, dtype=torch.float32)
         route = self.planner.route(start, end, self.field, self.robot.time) if pausing else None
-        if route is not None and not self.planner.leads_on(route, self.robot.time):
+        if route is not None and not self.planner.leads_on(route, self.field, self.robot.time):
             return None
         plan = self.plan or self.giving_way.plan
         if plan is not None:

@@ -42,13 +42,12 @@ class SearchGrid:
         """Number of the position closest to a place [m]."""
         return int((self.positions - place).norm(dim=1).argmin())
 
-    def room(self, way: Float[Tensor, "m 2"], robot: Float[Tensor, "2"], apart: float) -> float:
-        """Open area [m^2] that can be reached from a way [m] without coming nearer to a robot [m] than `apart` [m].
+    def room(self, places: Float[Tensor, "m 2"], robot: Float[Tensor, "2"], apart: float) -> float:
+        """Open area [m^2] that can be reached from a place [m] without coming nearer to a robot [m] than `apart` [m].
 
-        Of several areas that the way leads through the largest; 0 if all that is open of it is nearer than that, inf if
-        it is nowhere open.
+        Of several places that with the largest area counts; 0 if all that are open are nearer, inf if none is open.
         """
-        cells = [self.nearest(place) for place in way]
+        cells = [self.nearest(place) for place in places]
         if not self.open[cells].any():
             return math.inf
         far = self.open & ((self.positions - robot).norm(dim=1) >= apart)
@@ -58,9 +57,9 @@ class SearchGrid:
         return float(sizes[regions.ravel()[cells]].max()) * self.spacing**2
 
     def nearest_with_room(
-        self, start: Float[Tensor, "2"], way: Float[Tensor, "m 2"], apart: float, area: float
+        self, start: Float[Tensor, "2"], places: Float[Tensor, "m 2"], apart: float, area: float
     ) -> Float[Tensor, "k 2"]:
-        """The cheapest path [m] to where a robot leaves more `room` than an area [m^2]; or the start, if nowhere."""
+        """The cheapest path [m] to where a robot leaves places more `room` [m^2]; the start, if nowhere."""
         reach, before = cheapest(self.cost, self.shape, self.spacing, self.nearest(start))
         far = -math.inf
         for cell in reach.argsort().tolist():
@@ -69,7 +68,7 @@ class SearchGrid:
             if reach[cell] < far + 2 * self.spacing:
                 continue
             far = float(reach[cell])
-            if self.room(way, self.positions[cell], apart) > area:
+            if self.room(places, self.positions[cell], apart) > area:
                 return torch.cat([start[None], self.positions[traced(before, cell)][1:]])
         return start[None]
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from planning.grid_search import Route
+from planning.search_grid import SearchGrid
 
 # Who came into the way and has stayed for so many looks may be shut in by the robot. If he has no more room [m^2] than
 # that without coming nearer to it than this [m], it goes out of his way, so far [m], for some time [s].
@@ -71,24 +72,30 @@ class VainLooks:
         visits = (torch.cdist(entries, entries) <= radius).sum(dim=1)
         return entries[visits >= torch.tensor([self.looks[look.came] for look in looks])]
 
-    def makes_room(self, route: Route, now: float) -> bool:
-        """Whether the base is to go out of the way of what came into its own: once, where that is shut in by it."""
+    def makes_room(self, route: Route, whom: Float[Tensor, "m 2"], now: float) -> bool:
+        """Whether the base is to go out of the way of what came into its own: once, where that is shut in by it.
+
+        Args:
+            route: the way.
+            whom: where that may be [m].
+            now: [s].
+        """
         assert route.entry is not None
         if self._withdrew is None or now - self._withdrew.when >= self.memory:
             waited = self.at(route.entry, now, came=True) >= WAITED
-            if not waited or route.grid.room(route.onward, route.path[0], NEARER) > SHUT_IN:
+            if not waited or not _shuts_in(route.grid, route.path[0], whom, NEARER):
                 return False
             self._withdrew = _Look(now, route.entry, True)
         return self._near(self._withdrew, route.entry) and now - self._withdrew.when < MAKES_ROOM
 
-    def out_of_the_way(self, route: Route) -> Float[Tensor, "k 2"]:
+    def out_of_the_way(self, route: Route, whom: Float[Tensor, "m 2"]) -> Float[Tensor, "k 2"]:
         """The path [m] to the nearest place where it shuts in nobody; the position itself where there is none."""
-        return route.grid.nearest_with_room(route.path[0], route.onward, OUT_OF_WAY, SHUT_IN)
+        return route.grid.nearest_with_room(route.path[0], whom, OUT_OF_WAY, SHUT_IN)
 
-    def not_in_the_way(self, route: Route) -> Float[Tensor, "k 2"]:
+    def not_in_the_way(self, route: Route, whom: Float[Tensor, "m 2"]) -> Float[Tensor, "k 2"]:
         """The path of a route [m] up to the last place where the base shuts in nobody, its first position at least."""
         for end in range(len(route.path), 1, -STRIDE):
-            if route.grid.room(route.onward, route.path[end - 1], OUT_OF_WAY) > SHUT_IN:
+            if not _shuts_in(route.grid, route.path[end - 1], whom, OUT_OF_WAY):
                 return route.path[:end]
         return route.path[:1]
 
@@ -98,3 +105,9 @@ class VainLooks:
 
     def _near(self, look: _Look, place: Float[Tensor, "2"]) -> bool:
         return bool((look.place - place).norm() <= self.near)
+
+
+def _shuts_in(grid: SearchGrid, robot: Float[Tensor, "2"], whom: Float[Tensor, "m 2"], nearer: float) -> bool:
+    """Whether somebody has no way out but one nearer to a robot than some distance [m], or than he is already."""
+    away = float((whom - robot).norm(dim=1).max()) - grid.spacing
+    return grid.room(whom, robot, min(nearer, away)) <= SHUT_IN

@@ -86,8 +86,8 @@ class Recording:
             "time": times,
             "joint_names": np.array(names),
             "joint_positions": postures,
-            "object_names": np.array(list(self._movers), dtype=str),
-            "object_poses": self._object_poses(),
+            "object_names": np.array(self.movers, dtype=str),
+            "object_poses": self.object_poses(),
         }
         if names[:3] == ("base_x", "base_y", "base_yaw"):
             arrays["base_pose"] = postures[:, :3]
@@ -98,8 +98,13 @@ class Recording:
             }
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
-    def _object_poses(self) -> Float[np.ndarray, "n k 4 4"]:
-        """Of all that ever moved, at every state."""
+    @property
+    def movers(self) -> tuple[str, ...]:
+        """Names of the solids with a mass and of those that were moved or added."""
+        return tuple(self._movers)
+
+    def object_poses(self) -> Float[np.ndarray, "n k 4 4"]:
+        """Poses [m] of the `movers` at every state, NaN while one is not in the world."""
         poses = np.full((len(self), len(self._movers), 4, 4), np.nan)
         for k, name in enumerate(self._movers):
             if name in self._at_start:

@@ -196,7 +196,8 @@ def test_who_is_shut_in_by_the_robot_is_given_room_once(shut_in: bool) -> None:
     assert rooms[0] < 3.0 < 20.0 < rooms[1]
     assert planner.plan(back, goal, occupied, now=10.0).dead_end, "it stays there"
     far = planner.route(torch.tensor([-2.5, 0.0]), goal, occupied)
-    assert not planner.leads_on(planner.route(back, goal, occupied), 10.0) and planner.leads_on(far, 27.0)
+    assert not planner.leads_on(planner.route(back, goal, occupied), occupied, 10.0)
+    assert planner.leads_on(far, occupied, 27.0)
 
 
 def test_who_stands_at_the_goal_beside_the_robot_is_given_room() -> None:
@@ -224,7 +225,7 @@ def test_it_waits_where_it_shuts_in_nobody(shut_in: bool) -> None:
     end = plan.result.trajectory.waypoints[-1]
     assert plan.usable and route.grid.room(route.onward, end, 1.2) > 20.0
     assert (float((end - plan.onward[0]).norm()) < 1.2) != shut_in
-    assert not planner.leads_on(planner.route(end, goal, occupied), 2.0)
+    assert not planner.leads_on(planner.route(end, goal, occupied), occupied, 2.0)
 
 
 def test_the_robot_waits_for_what_came_and_goes_on_when_it_is_gone() -> None:
