@@ -305,14 +305,14 @@ class BasePlanner:
         It stands off from the first, and where it does not stand in the way of what came; but it backs off only after a
         while: what came may walk on at once, and who backs off has to turn away and back again.
         """
-        whom = route.onward
+        somebody = blocker
         if blocker is not None:
             off = blocker - route.path[0]
-            whom = (blocker + HALF_AS_WIDE / off.norm().clamp_min(1e-6) * off)[None]
-        if self._looks.makes_room(route, whom, now):
-            return replace(route, path=self._looks.out_of_the_way(route, whom))
+            somebody = blocker + HALF_AS_WIDE / off.norm().clamp_min(1e-6) * off
+        if self._looks.makes_room(route, somebody, now):
+            return replace(route, path=self._looks.out_of_the_way(route, somebody))
         near = _until(route, self.config.stand_off)
-        return replace(near, path=self._looks.not_in_the_way(near, whom))
+        return replace(near, path=self._looks.not_in_the_way(near, somebody))
 
     def _passing(
         self, sdf: DistanceField, places: Float[Tensor, "m 2"], deepest: Float[Tensor, "m 3"]

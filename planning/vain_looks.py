@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from planning.grid_search import Route
-from planning.search_grid import SearchGrid
 
 # Who came into the way and has stayed for so many looks may be shut in by the robot. If he has no more room [m^2] than
-# that without coming nearer to it than this [m], it goes out of his way, so far [m], for some time [s].
-WAITED, SHUT_IN, NEARER, OUT_OF_WAY, MAKES_ROOM = 4, 6.0, 1.0, 1.3, 20.0
+# that without coming nearer to it than this [m], it goes out of his way, so far [m], for some time [s]; to where he has
+# more room [m^2] than a room with the passage to it, which is no way out.
+WAITED, SHUT_IN, NEARER, OUT_OF_WAY, MAKES_ROOM, WAY_OUT = 4, 6.0, 1.0, 1.1, 20.0, 12.0
 
 # Of a path every so many positions are tried.
 STRIDE = 3
@@ -72,30 +72,31 @@ class VainLooks:
         visits = (torch.cdist(entries, entries) <= radius).sum(dim=1)
         return entries[visits >= torch.tensor([self.looks[look.came] for look in looks])]
 
-    def makes_room(self, route: Route, whom: Float[Tensor, "m 2"], now: float) -> bool:
+    def makes_room(self, route: Route, somebody: Float[Tensor, "2"] | None, now: float) -> bool:
         """Whether the base is to go out of the way of what came into its own: once, where that is shut in by it.
 
         Args:
             route: the way.
-            whom: where that may be [m].
+            somebody: where that is [m]; None if only the way is known that it blocks.
             now: [s].
         """
         assert route.entry is not None
         if self._withdrew is None or now - self._withdrew.when >= self.memory:
             waited = self.at(route.entry, now, came=True) >= WAITED
-            if not waited or not _shuts_in(route.grid, route.path[0], whom, NEARER):
+            if not waited or not _shuts_in(route, route.path[0], somebody, NEARER):
                 return False
             self._withdrew = _Look(now, route.entry, True)
         return self._near(self._withdrew, route.entry) and now - self._withdrew.when < MAKES_ROOM
 
-    def out_of_the_way(self, route: Route, whom: Float[Tensor, "m 2"]) -> Float[Tensor, "k 2"]:
-        """The path [m] to the nearest place where it shuts in nobody; the position itself where there is none."""
-        return route.grid.nearest_with_room(route.path[0], whom, OUT_OF_WAY, SHUT_IN)
+    def out_of_the_way(self, route: Route, somebody: Float[Tensor, "2"] | None) -> Float[Tensor, "k 2"]:
+        """The path [m] to the nearest place that leaves him a way out; the position itself where there is none."""
+        places = route.onward if somebody is None else somebody[None]
+        return route.grid.nearest_with_room(route.path[0], places, OUT_OF_WAY, WAY_OUT)
 
-    def not_in_the_way(self, route: Route, whom: Float[Tensor, "m 2"]) -> Float[Tensor, "k 2"]:
+    def not_in_the_way(self, route: Route, somebody: Float[Tensor, "2"] | None) -> Float[Tensor, "k 2"]:
         """The path of a route [m] up to the last place where the base shuts in nobody, its first position at least."""
         for end in range(len(route.path), 1, -STRIDE):
-            if not _shuts_in(route.grid, route.path[end - 1], whom, OUT_OF_WAY):
+            if not _shuts_in(route, route.path[end - 1], somebody, OUT_OF_WAY):
                 return route.path[:end]
         return route.path[:1]
 
@@ -107,7 +108,11 @@ class VainLooks:
         return bool((look.place - place).norm() <= self.near)
 
 
-def _shuts_in(grid: SearchGrid, robot: Float[Tensor, "2"], whom: Float[Tensor, "m 2"], nearer: float) -> bool:
+def _shuts_in(
+    route: Route, robot: Float[Tensor, "2"], somebody: Float[Tensor, "2"] | None, nearer: float
+) -> bool:
     """Whether somebody has no way out but one nearer to a robot than some distance [m], or than he is already."""
-    away = float((whom - robot).norm(dim=1).max()) - grid.spacing
-    return grid.room(whom, robot, min(nearer, away)) <= SHUT_IN
+    if somebody is None:
+        return route.grid.room(route.onward, robot, nearer) <= SHUT_IN
+    away = float((somebody - robot).norm()) - route.grid.spacing
+    return route.grid.room(somebody[None], robot, min(nearer, away)) <= SHUT_IN
