@@ -216,8 +216,13 @@ class BasePlanner:
         def passing(places: Tensor, deepest: Tensor) -> Tensor:
             return self._passing(explored, places, deepest)
 
-        closed = self._looks.closed(now, self.config.search.closed_radius)
-        route = grid_search(self.body, explored, start, goal, self.config.search, closed, passing)
+        search = self.config.search
+        closed = self._looks.closed(now, search.closed_radius)
+        route = grid_search(self.body, explored, start, goal, search, closed, passing)
+        if route.entry is None and not route.reaches_goal and self._looks.any_came(now):
+            # There is no other way than the one that somebody stood in for long: it is waited for again.
+            closed = self._looks.closed(now, search.closed_radius, for_good=True)
+            route = grid_search(self.body, explored, start, goal, search, closed, passing)
         self._once_free.add(route.grid.free)
         return route
 

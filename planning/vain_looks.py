@@ -63,9 +63,15 @@ class VainLooks:
         """Whether any was at what came."""
         return any(look.came for look in self._recent(now))
 
-    def closed(self, now: float, radius: float) -> Float[Tensor, "c 2"] | None:
-        """Entries [m] into blocked space that stayed blocked however often the robot looked within a radius [m]."""
-        looks = self._recent(now)
+    def closed(self, now: float, radius: float, for_good: bool = False) -> Float[Tensor, "c 2"] | None:
+        """Entries [m] into blocked space that stayed blocked however often the robot looked within a radius [m].
+
+        Args:
+            now: [s].
+            radius: [m].
+            for_good: only those that nothing has come into, which may go again.
+        """
+        looks = [look for look in self._recent(now) if not (for_good and look.came)]
         if not looks:
             return None
         entries = torch.stack([look.place for look in looks])
