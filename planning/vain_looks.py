@@ -14,6 +14,9 @@ from planning.grid_search import Route
 # that without coming nearer to it than this [m], it goes out of his way, so far [m], for some time [s]; to where he has
 # more room [m^2] than a room with the passage to it, which is no way out.
 WAITED, SHUT_IN, NEARER, OUT_OF_WAY, MAKES_ROOM, WAY_OUT = 4, 6.0, 1.0, 1.1, 20.0, 12.0
+# Who stays for so many looks may be shut in by what the map does not know of: it goes so far back [m], whatever room
+# there seems to be.
+LONG, FAR_BACK = 10, 3.0
 
 # Of a path every so many positions are tried.
 STRIDE = 3
@@ -50,6 +53,7 @@ class VainLooks:
         """Nothing was looked at."""
         self._looks: list[_Look] = []
         self._withdrew: _Look | None = None
+        self._far_back = False
 
     def add(self, now: float, place: Float[Tensor, "2"], came: bool) -> None:
         """The base looks in vain, at a time [s], at where it would enter blocked space [m], perhaps by what came."""
@@ -88,14 +92,17 @@ class VainLooks:
         """
         assert route.entry is not None
         if self._withdrew is None or now - self._withdrew.when >= self.memory:
-            waited = self.at(route.entry, now, came=True) >= WAITED
-            if not waited or not _shuts_in(route, route.path[0], somebody, NEARER):
+            looks = self.at(route.entry, now, came=True)
+            self._far_back = looks >= LONG
+            if looks < WAITED or not (self._far_back or _shuts_in(route, route.path[0], somebody, NEARER)):
                 return False
             self._withdrew = _Look(now, route.entry, True)
         return self._near(self._withdrew, route.entry) and now - self._withdrew.when < MAKES_ROOM
 
     def out_of_the_way(self, route: Route, somebody: Float[Tensor, "2"] | None) -> Float[Tensor, "k 2"]:
         """The path [m] to the nearest place that leaves him a way out; the position itself where there is none."""
+        if self._far_back and route.entry is not None:
+            return route.grid.way_back(route.path[0], route.entry, FAR_BACK)
         places = route.onward if somebody is None else somebody[None]
         return route.grid.nearest_with_room(route.path[0], places, OUT_OF_WAY, WAY_OUT)
 
