@@ -93,8 +93,9 @@ def test_while_it_waits_it_looks_at_what_came_even_where_no_way_is_left_to_try()
     robot = Unicycle()
     barrier = Crowd([(1.6, y / 4) for y in range(-24, 25)], (9.0, 9.0))
     search = GridSearchConfig(padding=1.5, through_blocked=30.0, closed_radius=30.0)
+    # Some seconds later it goes back to make room.
     config = replace(
-        QUICK, planner=replace(QUICK.planner, search=search, looks_came=1), time_limit=25.0, patience=15
+        QUICK, planner=replace(QUICK.planner, search=search, looks_came=1), time_limit=18.0, patience=15
     )
     drive(robot, lambda: FREE if robot.time < 3.0 else barrier, config)
     late = [look for look in robot.looked_at if look[2] < 1.1][-20:]
