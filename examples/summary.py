@@ -91,10 +91,8 @@ def draw_clearance(axes: Axes, episode: Episode, truth: SceneField | None) -> No
         field, label = episode.mapper.field(), "in the last map"
         clear = (field.distance(centres) - radii).amin(dim=1).numpy()
     else:
-        clear, label = (
-            clearances(truth, centres, radii, recording.movers, recording.object_poses()[some]),
-            "in truth",
-        )
+        label = "in truth"
+        clear = clearances(truth, centres, radii, recording.movers, recording.object_poses()[some])
     axes.plot(times, 100 * clear, label=f"{label}: least {100 * clear.min():.0f} cm")
     axes.axhline(0.0, color="black", linewidth=1.0)
     axes.axhspan(0.0, 100 * LEAST, color="0.9")

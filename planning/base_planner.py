@@ -249,6 +249,10 @@ class BasePlanner:
             return ExploredField(sdf, self._trodden, self.config.wary)
         return sdf
 
+    def _workspace(self, sdf: DistanceField) -> Workspace:
+        """Clearances and unknown space by the rules of the search."""
+        return Workspace(self.body, sdf, eps=1.0, config=self.config.search.workspace)
+
     def _optimised(self, route: Route, sdf: DistanceField) -> PlanResult:
         """CHOMP from the route, or the route itself where CHOMP fails or leaves seen space.
 
@@ -278,7 +282,7 @@ class BasePlanner:
 
     def _stays_in_seen_space(self, path: Trajectory, sdf: DistanceField) -> bool:
         """Whether a path enters no unknown space, by the rules of the search."""
-        workspace = Workspace(self.body, sdf, eps=1.0, config=self.config.search.workspace)
+        workspace = self._workspace(sdf)
         centres, _ = self.body.spheres(Trajectory.through(path.waypoints, 4 * len(path)).waypoints)
         unknown = workspace.unknown(centres)
         return unknown is None or not bool(unknown.any())
@@ -327,7 +331,7 @@ class BasePlanner:
             return torch.zeros(len(places), dtype=torch.bool)
         out = sdf.by_what_came(deepest)
         if out.any():
-            workspace = Workspace(self.body, sdf, eps=1.0, config=self.config.search.workspace)
+            workspace = self._workspace(sdf)
             centres, radii = self.body.spheres(places[out])
             cut = workspace.clearance(centres, radii) < self.config.search.least_margin
             alone = ~cut
@@ -345,7 +349,7 @@ class BasePlanner:
         """Where what blocks the way is [m], if the field knows that it came."""
         if route.entry is None or not isinstance(sdf, ExploredField):
             return None
-        workspace = Workspace(self.body, sdf, eps=1.0, config=self.config.search.workspace)
+        workspace = self._workspace(sdf)
         centres, radii = self.body.spheres(route.entry)
         clearance = workspace.clearance(centres, radii)
         deepest = centres[clearance.argmin()]

@@ -93,15 +93,20 @@ class VainLooks:
         assert route.entry is not None
         if self._withdrew is None or now - self._withdrew.when >= self.memory:
             looks = self.at(route.entry, now, came=True)
-            self._far_back = looks >= LONG
-            if looks < WAITED or not (self._far_back or _shuts_in(route, route.path[0], somebody, NEARER)):
+            long = looks >= LONG
+            if looks < WAITED or not (long or _shuts_in(route, route.path[0], somebody, NEARER)):
                 return False
+            self._far_back = long
             self._withdrew = _Look(now, route.entry, True)
         return self._near(self._withdrew, route.entry) and now - self._withdrew.when < MAKES_ROOM
 
     def out_of_the_way(self, route: Route, somebody: Float[Tensor, "2"] | None) -> Float[Tensor, "k 2"]:
-        """The path [m] to the nearest place that leaves him a way out; the position itself where there is none."""
-        if self._far_back and route.entry is not None:
+        """The path [m] to the nearest place that leaves him a way out; the position itself where there is none.
+
+        Far back, whatever room there seems to be, if that is why the base `makes_room`.
+        """
+        assert route.entry is not None
+        if self._far_back:
             return route.grid.way_back(route.path[0], route.entry, FAR_BACK)
         places = route.onward if somebody is None else somebody[None]
         return route.grid.nearest_with_room(route.path[0], places, OUT_OF_WAY, WAY_OUT)
