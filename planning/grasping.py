@@ -49,7 +49,7 @@ class GraspConfig:
         square: the same for the face's mean normal seen along the fingers: a finger can lie against a face that slopes
             a little, and maps round the edges of what is flat, but a face that is turned pushes the thing away.
         hold: least share of a finger's pad, as far as it reaches over the object, that touches it.
-        above: the fingers stay so far over the support [m], by what the map and the arm may be wrong.
+        above: the hand stays so far over the support [m], by what the map and the arm may be wrong.
         room: least clearance of the open hand [m]; negative by what the map and the balls may be wrong.
         seen: least share of each finger that is in space that was seen: unknown is not free.
         retreat: the hand needs room along its way from this far before the grasp, too [m].
@@ -221,9 +221,8 @@ def _bite(
     down = -float(turn[2, 2])
     if down < 0.2:  # level fingers come no higher by reaching less far
         return torch.full_like(front, bite)
-    lowest = float(((hand.centres @ turn.T)[:, 2] - hand.radii).min())
     tool = turn[2, 0] * across + turn[2, 2] * (front + bite - hand.tips)
-    return bite - (floor - (tool + lowest)).clamp_min(0.0) / down
+    return bite - (floor - (tool - hand.below(turn))).clamp_min(0.0) / down
 
 
 def _outermost(values: Tensor, mask: Tensor) -> Float[Tensor, " k"]:
@@ -260,6 +259,9 @@ def _score(
 
 def _with_room(room: RoomRound, grasps: Grasps, hand: ParallelHand, config: GraspConfig) -> Grasps:
     """The best of those whose open hand is clear at the grasp and on the straight way to it; no two nearly alike."""
+    T = grasps.T_world_tool
+    above = T[:, 2, 3] - hand.below(T[:, :3, :3]) - room.surface.support
+    grasps = grasps.take(above >= config.above - 1e-5)
     grasps = grasps.take(grasps.score.argsort(descending=True)[: 40 * config.most])
     seen = room.seen_share(grasps.T_world_tool, hand)
     grasps = replace(grasps, score=grasps.score - UNSEEN * (1 - seen)).take(seen >= config.seen)

@@ -37,6 +37,10 @@ class ParallelHand:
     opening: float
     tips: float
 
+    def below(self, turn: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n"]:
+        """How far the hand reaches below its origin [m] when it is turned so."""
+        return (self.radii - (self.centres @ turn[..., 2, :, None]).squeeze(-1)).amax(dim=-1)
+
 
 class RoomRound:
     """The space round an object: a field where it was seen, the object's surface where it was not.

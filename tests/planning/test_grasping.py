@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -191,13 +192,25 @@ def test_flat_things_are_taken_from_above(tilt: float) -> None:
     assert surface.points[:, 0].max() - surface.points[:, 0].min() == pytest.approx(0.2, abs=0.012)
     grasps = find_grasps(field, surface, HAND)
     assert len(grasps) > 0
-    centres = (
-        HAND.centres @ grasps.T_world_tool[:, :3, :3].transpose(1, 2) + grasps.T_world_tool[:, None, :3, 3]
+    lowest = grasps.T_world_tool[:, 2, 3] - HAND.below(grasps.T_world_tool[:, :3, :3])
+    assert lowest.min() > 0.7 + 0.5 * GraspConfig().above
+    assert lowest.min() < 0.7 + height
+
+
+def test_a_level_hand_stays_over_the_support() -> None:
+    field = Union(TABLE, carton())
+    surface = object_surface(field, torch.tensor([0.0, 0.0, 0.823]))
+    config = GraspConfig(pitches=(0.0,), bites=(0.012, 0.02), antipodal=0.5)
+    low = replace(surface, middle=torch.tensor([0.0, 0.0, 0.7]))  # a heavy foot: low grasps are the best
+    grasps = find_grasps(field, low, HAND, config=config)
+    assert len(grasps) > 0
+    T = grasps.T_world_tool
+    lowest = (
+        torch.stack([T[:, :3, :3] @ centre for centre in HAND.centres])[..., 2]
+        + T[:, 2, 3]
+        - HAND.radii[:, None]
     )
-    lowest = (centres[..., 2] - HAND.radii).amin(dim=1)
-    down = grasps.T_world_tool[:, 2, 2] < -0.2
-    assert down.any() and lowest[down].min() > 0.7 + 0.5 * GraspConfig().above
-    assert lowest[down].min() < 0.7 + height
+    assert lowest.min() > surface.support + 0.9 * config.above
 
 
 class Tilted(AutogradField):
