@@ -15,6 +15,7 @@ from examples.disturbances import DisturbedRobot
 from planning.grasping import GraspConfig, Grasps
 from planning.hand_room import ParallelHand
 from planning.protocols import DistanceField
+from planning.validation import check
 from planning.workspace import Workspace
 from robots.fine_cover import fine_cover
 from robots.inverse_kinematics import solve
@@ -99,7 +100,10 @@ def reachable_grasps(
             moved = (model.spheres(ways)[0] - model.spheres(q)[0]).norm(dim=-1).amax(dim=0) > MOVED
             if clearance(model, ways, field, arm & moved) < ARM_ROOM:
                 continue
-            if clearance(model, ends.q[i : i + 1], field) > 0:
+            if (
+                check(model, planning.Trajectory.through(ends.q[i : i + 1]), field).status
+                is planning.Status.SUCCESS
+            ):
                 yield Grasp(approach, lift)
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 import isdf
 from examples.arm import (
+    MOVED,
     Grasp,
     clearance,
     execute,
@@ -51,6 +52,9 @@ SPACING = 0.03
 """Of the baked map that the arm plans in [m]."""
 AROUND = 0.03
 """The robot has at least so much room about it where it stands [m]: it drove there."""
+STANDS = 0.08
+"""And so much about what neither arm nor torso moves [m]: nearer to the floor than an arm keeps, it would let the arm
+come as near to everything."""
 TORSO_STEPS = 12
 """Heights of the torso that stand for all."""
 PLANS = 4
@@ -187,22 +191,27 @@ def field_for_reaching(episode: Episode) -> DistanceField:
     distance = episode.mapper.field().distance(points)
     centres, radii = own_space(episode)
     for block in torch.arange(len(points)).split(64):
-        inside = (radii - torch.cdist(points[block].reshape(-1, 3), centres)).amax(dim=1) + AROUND
+        inside = (radii - torch.cdist(points[block].reshape(-1, 3), centres)).amax(dim=1)
         inside = inside.view(distance[block].shape)
         distance[block] = torch.where(inside > 0, torch.maximum(distance[block], inside), distance[block])
     return isdf.GridField(distance, bounds[0], SPACING)
 
 
 def own_space(episode: Episode) -> tuple[torch.Tensor, torch.Tensor]:
-    """Balls (n, 3), (n,) [m] in which the robot is, or its torso when it rises or sinks: its camera never sees them."""
+    """Balls (n, 3), (n,) [m] that are free: round the robot, and round its torso when it rises or sinks.
+
+    Its camera sees none of that.
+    """
     model = episode.model
     q = torch.as_tensor(episode.robot.posture(), dtype=torch.float32).repeat(1 + TORSO_STEPS, 1)
     lift = model.joint_names.index(LIFT)
     q[1:, lift] = torch.linspace(*model.joint_limits[lift].tolist(), TORSO_STEPS)
     centres, radii = model.spheres(q)
-    rising = torch.tensor([link.startswith("torso") for link in model.sphere_links])
-    risen = centres[1:, rising].reshape(-1, 3)
-    return torch.cat([centres[0], risen]), torch.cat([radii, radii[rising].repeat(TORSO_STEPS)])
+    risen = (centres - centres[0]).norm(dim=-1).amax(dim=0) > MOVED
+    radii = radii + torch.where(risen, AROUND, STANDS)
+    rising = torch.tensor([link.startswith("torso") for link in model.sphere_links]) & risen
+    higher = centres[1:, rising].reshape(-1, 3)
+    return torch.cat([centres[0], higher]), torch.cat([radii, radii[rising].repeat(TORSO_STEPS)])
 
 
 def take(

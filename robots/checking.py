@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 import numpy as np
-import torch
 import trimesh
 from torch import Tensor
 
@@ -16,6 +15,7 @@ from robots.errors import RobotError
 from robots.link_geometry import collision_pieces
 from robots.link_pairs import random_configurations
 from robots.model import Robot
+from robots.self_collision import self_gaps
 from robots.sphere_fitting import SphereFit, measure, protruding
 
 MAX_UNCOVERED = 2e-3  # [m] that geometry may stand out of the spheres before a set counts as unsafe
@@ -69,7 +69,7 @@ def check_spheres(
     Raises `RobotError` where pybullet is missing.
     """
     q = random_configurations(robot, configurations, seed)
-    sphere_gaps = _sphere_gaps(robot, q)
+    sphere_gaps = self_gaps(robot, q).double().numpy()
     hull_gaps = _hull_gaps(robot, q, progress)
     touching, colliding = sphere_gaps <= 0, hull_gaps <= 0
     missed = colliding & ~touching
@@ -127,19 +127,6 @@ def _surface_gaps(
             placed = np.concatenate([points, piece.vertices]) @ poses[link][:3, :3].T + poses[link][:3, 3]
             gaps.append(protruding(spheres, placed))
     return np.concatenate(gaps) if gaps else np.zeros(1)
-
-
-def _sphere_gaps(robot: Robot, q: Tensor) -> np.ndarray:
-    """Least gap (n,) [m] between spheres of the pairs that are tested, infinite where there are none."""
-    first, second = robot.self_collision_pairs.unbind(-1)
-    if len(first) == 0:
-        return np.full(len(q), np.inf)
-    gaps = []
-    for part in q.split(50):
-        centres, radii = robot.spheres(part)
-        distances = (centres[:, first] - centres[:, second]).norm(dim=-1)
-        gaps.append((distances - radii[first] - radii[second]).amin(-1))
-    return torch.cat(gaps).double().numpy()
 
 
 def _hull_gaps(

@@ -12,6 +12,7 @@ from torch import Tensor
 from robots.errors import RobotError, UnknownJointError
 from robots.model import Robot
 from robots.numbers import refuse_nan
+from robots.self_collision import self_gaps
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,8 @@ def solve(
         seed: of the random starts.
         config: step sizes and iterations.
 
-    Of several converged starts the one nearest to the seed is returned. Raises `RobotError` for a robot
+    Of several converged starts the one nearest to the seed is returned, but one in which the robot touches itself only
+    where all do. Raises `RobotError` for a robot
     without a tool link or badly shaped arguments, `UnknownJointError` for joints that are not planned.
     """
     config = config or IkConfig()
@@ -98,8 +100,10 @@ def solve(
     orientation = error[:, 3:].norm(dim=-1).view(-1, num_seeds)
     good = (position <= position_tolerance) & (orientation <= orientation_tolerance)
     q = q.view(len(targets), num_seeds, -1)
-    # Unconverged starts rank behind all converged ones, by their error instead of by their way.
+    # Behind all others rank the unconverged, by their error; before them postures in which the robot touches itself.
     way = (q - home[:, None]).norm(dim=-1)
+    if num_seeds > 1:
+        way += 1e3 * (self_gaps(robot, q.reshape(-1, robot.num_dofs)) < 0).view_as(way)
     rank = torch.where(good, way, 1e6 + position + config.length * orientation)
     best = rank.argmin(1, keepdim=True)
     chosen = q.gather(1, best[..., None].expand(-1, -1, q.shape[-1])).squeeze(1)

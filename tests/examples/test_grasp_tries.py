@@ -10,10 +10,12 @@ import pytest
 import torch
 
 from examples import grasp
+from examples.arm import clearance, parked, within_limits
 from examples.episode import Episode, EpisodeOptions
 from examples.grasp_stages import (
     LIFT,
     draw_back,
+    field_for_reaching,
     heights_to_look_from,
     holds_nothing,
     own_space,
@@ -84,6 +86,11 @@ def test_the_hand_feels_itself_and_the_arm_draws_back(tmp_path: Path) -> None:
     centres, radii = own_space(episode)
     deep = (radii - torch.cdist(balls[:, torso].reshape(-1, 3), centres)).amax(dim=1)
     assert bool((deep > sizes[torso].repeat(9) - 0.02).all()), "it may sink again"
+    arm, posture = parked(episode.model, tucked)
+    room = clearance(arm, within_limits(arm, posture)[None], field_for_reaching(episode))
+    assert room > 0.03, (
+        "the base, which stands still, does not let the arm come nearer to things than its margin"
+    )
     assert not holds_nothing(episode)
     robot.world.command_gripper(0.0, 30.0)
     robot.wait(1.0)
