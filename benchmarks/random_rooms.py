@@ -13,6 +13,8 @@ from robots.simulation.poses import planar_pose
 from robots.simulation.primitives import Box, Primitive
 
 KINDS = {"box": 0, "cylinder": 1, "sphere": 2}
+CEILINGS = 0.9
+"""Share of rooms with a ceiling: few cameras ever see one, but real rooms have it, at much the same height."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,10 @@ class RandomRoom:
 
 def random_room(rng: np.random.Generator) -> RandomRoom:
     """Walls, maybe a ceiling and inner walls with doorways, furniture by the walls and about the room, clutter."""
-    size = (float(rng.uniform(2.8, 9)), float(rng.uniform(2.8, 9)), float(rng.uniform(2.3, 3.2)))
+    height = float(np.clip(rng.normal(2.65, 0.2), 2.3, 3.2))
+    size = (float(rng.uniform(2.8, 9)), float(rng.uniform(2.8, 9)), height)
     solids: list[Primitive] = list(fn.room_shell(*size))
-    if rng.random() < 0.5:
+    if rng.random() < CEILINGS:
         solids.append(Box("ceiling", planar_pose(0, 0, size[2] + 0.06), (size[0] + 0.3, size[1] + 0.3, 0.12)))
     for axis in range(2):
         if size[axis] > 5 and rng.random() < 0.5:

@@ -45,6 +45,8 @@ DRAWN = 500
 LOOKS_COUNT = 4.0
 # Truth is asked for this far into walls and floor [m]; beyond them there is nothing to know.
 INTO_WALLS = 0.3
+# The learning rate rises for so many steps.
+WARM_UP = 300
 # Below this gap between the bounds [m] there is nothing to guess.
 LEAST_GAP = 0.02
 
@@ -77,11 +79,11 @@ class Train:
     """Folder that `data` wrote; files that arrive during training are used too."""
     out: Path
     """The weights."""
-    minutes: float = 40.0
+    minutes: float = 60.0
     """How long to train."""
-    batch: int = 2
+    batch: int = 4
     """Windows a step."""
-    rate: float = 2e-3
+    rate: float = 6e-4
     """Greatest learning rate."""
     start: Path | None = None
     """Weights to go on from."""
@@ -91,7 +93,7 @@ class Train:
     def run(self) -> None:
         """Every 25th room is left out and tells the error of windows never trained on."""
         torch.manual_seed(0)
-        net = CompletionNet()
+        net = CompletionNet().to(memory_format=torch.channels_last_3d)
         if self.start is not None:
             net.load_state_dict({k: v.float() for k, v in load_file(self.start).items()})
         if self.judge:
@@ -101,7 +103,7 @@ class Train:
         rng, begin, step, running = np.random.default_rng(0), time.time(), 0, 0.0
         while (spent := (time.time() - begin) / 60 / self.minutes) < 1:
             for group in optimiser.param_groups:
-                group["lr"] = self.rate * min(1, (step + 1) / 50) * (0.5 + 0.5 * np.cos(np.pi * spent))
+                group["lr"] = self.rate * min(1, (step + 1) / WARM_UP) * (0.5 + 0.5 * np.cos(np.pi * spent))
             optimiser.zero_grad()
             files = self.files(held=False)
             # One by one, for windows are of several sizes.
@@ -126,7 +128,7 @@ class Train:
     def save(self, net: CompletionNet) -> None:
         """Write the weights."""
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        save_file({k: v.half() for k, v in net.state_dict().items()}, self.out)
+        save_file({k: v.half().contiguous() for k, v in net.state_dict().items()}, self.out)
 
 
 def load(path: Path) -> Window:
@@ -149,7 +151,11 @@ def turned(window: Window, rng: np.random.Generator) -> Window:
 
 def predicted(net: CompletionNet, window: Window) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Distances, logarithm of the expected error over the gap, and the gap [m], each (nx, ny, nz)."""
-    share, width = (answer[0] for answer in net(window.x[None]))
+    x = window.x[None].to(memory_format=torch.channels_last_3d)
+    # Where the processor can, training in half precision takes a fifth of the time.
+    half = torch.is_grad_enabled() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=half):
+        share, width = (answer[0] for answer in net(x))
     upper, lower = window.x[0], window.x[1]
     # The map knows that free space is not inside anything.
     lower = torch.where(window.x[2] > 0, lower.clamp(min=0), lower)

@@ -46,15 +46,15 @@ class CompletionNet(nn.Module):
         def conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
             return nn.Sequential(nn.Conv3d(inputs, outputs, 3, stride, 1), nn.LeakyReLU(0.1))
 
-        self.down1 = nn.Sequential(conv(CHANNELS, 16, 2), conv(16, 24))
-        self.down2 = nn.Sequential(conv(24, 48, 2), conv(48, 48))
-        self.down3 = nn.Sequential(conv(48, 64, 2), conv(64, 64), conv(64, 64))
-        self.up2 = conv(64 + 48, 48)
-        self.up1 = conv(48 + 24, 24)
-        self.lift = nn.Conv3d(24, 24, 1)
-        self.local = nn.Conv3d(CHANNELS, 24, 1)
+        self.down1 = nn.Sequential(conv(CHANNELS, 16, 2), conv(16, 32))
+        self.down2 = nn.Sequential(conv(32, 64, 2), conv(64, 64))
+        self.down3 = nn.Sequential(conv(64, 96, 2), conv(96, 96), conv(96, 96), conv(96, 96))
+        self.rise2, self.rise1, self.rise0 = nn.Conv3d(96, 64, 1), nn.Conv3d(64, 32, 1), nn.Conv3d(32, 32, 1)
+        self.up2 = nn.Sequential(conv(64 + 64, 64), conv(64, 64))
+        self.up1 = conv(32 + 32, 32)
+        self.local = nn.Conv3d(CHANNELS, 32, 1)
         self.head = nn.Sequential(
-            nn.LeakyReLU(0.1), nn.Conv3d(24, 24, 1), nn.LeakyReLU(0.1), nn.Conv3d(24, 2, 1)
+            nn.LeakyReLU(0.1), nn.Conv3d(32, 32, 1), nn.LeakyReLU(0.1), nn.Conv3d(32, 2, 1)
         )
 
     def forward(
@@ -64,9 +64,10 @@ class CompletionNet(nn.Module):
         one = self.down1(x)
         two = self.down2(one)
         three = self.down3(two)
-        two = self.up2(torch.cat([_twice(three), two], dim=1))
-        one = self.up1(torch.cat([_twice(two), one], dim=1))
-        out = self.head(_twice(self.lift(one)) + self.local(x))
+        two = self.up2(torch.cat([_twice(self.rise2(three)), two], dim=1))
+        one = self.up1(torch.cat([_twice(self.rise1(two)), one], dim=1))
+        # It may be trained in half precision, which has too few digits for shares near 0 and 1.
+        out = self.head(_twice(self.rise0(one)) + self.local(x)).float()
         return torch.sigmoid(out[:, 0]), out[:, 1].clamp(-6, 1)
 
 

@@ -71,11 +71,11 @@ def test_it_is_exact_where_the_camera_looked_and_knows_where_that_was(orbit):
     assert sure.float().mean() > 0.12
     assert error[sure].abs().mean() < 0.0055
     assert error[sure].abs().mean() < 0.15 * error[~sure].abs().mean()
-    assert error.abs().mean() < 0.04
-    assert (error > 0.05).float().mean() < 0.038
+    assert error.abs().mean() < 0.027
+    assert (error > 0.05).float().mean() < 0.05
     everywhere = torch.cat([seen, room_points()])
     everywhere = everywhere[sdf(everywhere) > 0]
-    assert roc_area(field.confidence(everywhere), field.distance(everywhere) - sdf(everywhere)) > 0.89
+    assert roc_area(field.confidence(everywhere), field.distance(everywhere) - sdf(everywhere)) > 0.87
     assert field.confidence(seen).mean() > 0.63
     assert field.confidence(torch.tensor([[0.0, 0.0, 30.0]])) == 0
 
