@@ -153,7 +153,8 @@ def predicted(net: CompletionNet, window: Window) -> tuple[torch.Tensor, torch.T
     """Distances, logarithm of the expected error over the gap, and the gap [m], each (nx, ny, nz)."""
     x = window.x[None].to(memory_format=torch.channels_last_3d)
     # Where the processor can, training in half precision takes a fifth of the time.
-    half = torch.is_grad_enabled() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    able = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    half = able and torch.is_grad_enabled()
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=half):
         share, width = (answer[0] for answer in net(x))
     upper, lower = window.x[0], window.x[1]

@@ -1,11 +1,14 @@
 """What the completion network learns from: exact images of random rooms, and windows as the mapper makes them."""
 
+from pathlib import Path
+
 import numpy as np
+from safetensors.torch import load_file
 
 from benchmarks.camera_ways import camera_way
 from benchmarks.random_rooms import depth_image, random_room
-from benchmarks.train_completion import turned, windows
-from isdf.mapping.completion import CHANNELS, STRIDE
+from benchmarks.train_completion import Data, Train, turned, windows
+from isdf.mapping.completion import CHANNELS, STRIDE, CompletionNet
 
 
 def test_rays_end_at_the_first_surface():
@@ -42,3 +45,15 @@ def test_turning_a_window_turns_its_directions():
             slope = other.x[0].diff(dim=axis).narrow(1 - axis, 0, 8)
             along = other.x[4 + axis].narrow(axis, 0, slope.shape[axis]).narrow(1 - axis, 0, 8)
             assert (slope * along).sum() < 0
+
+
+def test_a_network_is_trained_from_windows_on_disk(tmp_path: Path):
+    Data(tmp_path / "windows", rooms=1, seed=3).run()
+    begun, out = tmp_path / "begun.safetensors", tmp_path / "weights.safetensors"
+    Train(tmp_path / "windows", begun, minutes=1e-9).run()
+    Train(tmp_path / "windows", out, minutes=0.03, batch=1).run()
+    weights, untrained = load_file(out), load_file(begun)
+    CompletionNet().load_state_dict(weights)
+    assert all(bool(value.isfinite().all()) for value in weights.values())
+    assert any(not value.equal(untrained[name]) for name, value in weights.items())
+    Train(tmp_path / "windows", out, start=out, judge=True).run()
