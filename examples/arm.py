@@ -100,10 +100,8 @@ def reachable_grasps(
             moved = (model.spheres(ways)[0] - model.spheres(q)[0]).norm(dim=-1).amax(dim=0) > MOVED
             if clearance(model, ways, field, arm & moved) < ARM_ROOM:
                 continue
-            if (
-                check(model, planning.Trajectory.through(ends.q[i : i + 1]), field).status
-                is planning.Status.SUCCESS
-            ):
+            before_it = planning.Trajectory.through(approach[:1])
+            if check(model, before_it, field).status is planning.Status.SUCCESS:
                 yield Grasp(approach, lift)
 
 

@@ -53,8 +53,8 @@ SPACING = 0.03
 AROUND = 0.03
 """The robot has at least so much room about it where it stands [m]: it drove there."""
 STANDS = 0.08
-"""And so much about what neither arm nor torso moves [m]: nearer to the floor than an arm keeps, it would let the arm
-come as near to everything."""
+"""And so much about what neither arm nor torso moves [m]: a reach is planned with the margin of the nearest part, and
+that is to be one that moves."""
 TORSO_STEPS = 12
 """Heights of the torso that stand for all."""
 PLANS = 4

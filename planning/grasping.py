@@ -26,6 +26,8 @@ FACE = 0.004
 """What lies within this of a grasp's widest place is the face that a finger closes on [m]."""
 OUTLIERS = 2
 """So many points on either side of a grasp may stick out, and are noise."""
+ROUNDING = 1e-5
+"""Bites that are as deep as the support allows end so far below that [m], at most."""
 SHALLOW = 0.006
 """Fingers that reach less far over an object [m] hold nothing."""
 LEVER = 8.0
@@ -261,7 +263,7 @@ def _with_room(room: RoomRound, grasps: Grasps, hand: ParallelHand, config: Gras
     """The best of those whose open hand is clear at the grasp and on the straight way to it; no two nearly alike."""
     T = grasps.T_world_tool
     above = T[:, 2, 3] - hand.below(T[:, :3, :3]) - room.surface.support
-    grasps = grasps.take(above >= config.above - 1e-5)
+    grasps = grasps.take(above >= config.above - ROUNDING)
     grasps = grasps.take(grasps.score.argsort(descending=True)[: 40 * config.most])
     seen = room.seen_share(grasps.T_world_tool, hand)
     grasps = replace(grasps, score=grasps.score - UNSEEN * (1 - seen)).take(seen >= config.seen)

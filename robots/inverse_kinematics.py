@@ -73,8 +73,8 @@ def solve(
         config: step sizes and iterations.
 
     Of several converged starts the one nearest to the seed is returned, but one in which the robot touches itself only
-    where all do. Raises `RobotError` for a robot
-    without a tool link or badly shaped arguments, `UnknownJointError` for joints that are not planned.
+    where all do. Raises `RobotError` for a robot without a tool link or badly shaped arguments, `UnknownJointError` for
+    joints that are not planned.
     """
     config = config or IkConfig()
     if robot.tool_link is None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from robots.model import Robot
+from robots.model import Robot
 
 CHUNK = 50
 """So many postures at a time, to bound memory."""

@@ -192,6 +192,7 @@ def test_flat_things_are_taken_from_above(tilt: float) -> None:
     assert surface.points[:, 0].max() - surface.points[:, 0].min() == pytest.approx(0.2, abs=0.012)
     grasps = find_grasps(field, surface, HAND)
     assert len(grasps) > 0
+    assert (grasps.T_world_tool[:, 2, 2] < -0.2).any(), "from above"
     lowest = grasps.T_world_tool[:, 2, 3] - HAND.below(grasps.T_world_tool[:, :3, :3])
     assert lowest.min() > 0.7 + 0.5 * GraspConfig().above
     assert lowest.min() < 0.7 + height
