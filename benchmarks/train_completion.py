@@ -30,7 +30,7 @@ from benchmarks.random_rooms import RandomRoom, depth_image, random_room
 from isdf import DepthFrame, Mapper, PinholeCamera
 from isdf.evaluation.metrics import UNSAFE
 from isdf.mapping.completion import CompletionNet, features
-from isdf.mapping.refresh import Surroundings, surroundings
+from isdf.mapping.refresh import Surroundings, middle_of_guesses, surroundings
 from isdf.mapping.values import LEAST_OF_ERROR
 from robots.simulation import DepthNoise, DepthNoiseConfig
 
@@ -262,7 +262,11 @@ def windows(rng: np.random.Generator) -> Iterator[tuple[str, Window]]:
             continue
         mapper.integrate(DepthFrame(measured, torch.from_numpy(T), camera, time=PERIOD * count))
         drawn.append(visible_points(rng, depth, T, camera))
-        around = surroundings(mapper.lattice, mapper.bricks, T[:3, 3], UP) if count in moments else None
+        if count not in moments:
+            continue
+        lattice, bounds = mapper.lattice, mapper.bounds.numpy().astype(float)
+        middle = middle_of_guesses(T[:3, 3], UP, bounds, lattice.spacing)
+        around = surroundings(lattice, mapper.bricks, middle, UP)
         if around is not None:
             points = np.round(np.concatenate(drawn) / mapper.lattice.spacing).astype(np.int64) - around.corner
             truth, mask = truth_of(room, around)

@@ -32,7 +32,7 @@ from .fusion import fuse, nearest_around
 from .lately import Lately
 from .lattice import Lattice
 from .motion import Moment, Motion
-from .refresh import guess, refresh
+from .refresh import guess, middle_of_guesses, refresh
 from .standing import extend_down, vertical
 from .visitors import Visitors
 
@@ -302,7 +302,8 @@ class Mapper(ShownMapper):
         lattice.write(begin, end, evidence=evidence)
 
     def _guess(self, eye: Float[np.ndarray, "3"]) -> None:
-        box = guess(self.lattice, self.bricks, self.network, eye, self.up)
+        middle = middle_of_guesses(eye, self.up, self._bounds.numpy().astype(float), self.lattice.spacing)
+        box = guess(self.lattice, self.bricks, self.network, middle, self.up)
         if box is not None:
             self._touch(box)
 

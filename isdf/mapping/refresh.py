@@ -20,7 +20,7 @@ from .values import Patches, Window, coarse_values
 
 # Surfaces this far outside a window still count in it [m].
 MARGIN = 2.5
-# Box about the camera in which distances are guessed: half its sides across and along the vertical [m], and at most so
+# Box in which distances are guessed: half its sides across and along the vertical [m], and at most so
 # many nodes, so that the network of a fine lattice takes no more memory and time than that of the default one.
 GUESS_ACROSS, GUESS_ALONG = 4.48, 2.56
 NODES_ACROSS, NODES_ALONG = 28, 16
@@ -30,7 +30,7 @@ Box = Float[np.ndarray, "2 3"]
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is proven in a box about the camera, turned as the network knows it: the vertical is the last axis, upwards.
+    """What is proven in a box, turned as the network knows it: the vertical is the last axis, upwards.
 
     Args:
         proven: of the box's nodes.
@@ -53,20 +53,44 @@ class Surroundings:
         return (answer[:, :, ::-1] if self.upside_down else answer).transpose(np.argsort(self.order))
 
 
+def middle_of_guesses(
+    eye: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"], bounds: Box, spacing: float
+) -> Float[np.ndarray, "3"]:
+    """The middle of the box to guess in [m]: as near to the camera as it can be and hold all of what was seen.
+
+    So a room that fits into the box is guessed as a whole, wherever in it the camera is; of more the box is filled.
+
+    Args:
+        eye: the camera's position [m].
+        up: any vector whose largest component tells the vertical; along it the box has its middle at the eye.
+        bounds: of what was seen [m].
+        spacing: of the lattice [m].
+    """
+    vertical = np.arange(3) == np.abs(up).argmax()
+    reach = _reach(up, spacing)
+    first, last = np.sort([bounds[0] + reach, bounds[1] - reach], axis=0)
+    return np.where(vertical, eye, np.clip(eye, first, last))
+
+
+def _reach(up: Float[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "3"]:
+    """Half the sides [m] of the box in which distances are guessed."""
+    vertical = np.arange(3) == np.abs(up).argmax()
+    across, along = min(GUESS_ACROSS, NODES_ACROSS * spacing), min(GUESS_ALONG, NODES_ALONG * spacing)
+    return np.where(vertical, along, across)
+
+
 def surroundings(
-    lattice: Lattice, bricks: BrickVolume, eye: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
+    lattice: Lattice, bricks: BrickVolume, middle: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
 ) -> Surroundings | None:
     """What the network goes by; None where there is nothing. Arguments as for `guess`."""
-    vertical = int(np.abs(up).argmax())
-    reach = np.full(3, min(GUESS_ACROSS, NODES_ACROSS * lattice.spacing))
-    reach[vertical] = min(GUESS_ALONG, NODES_ALONG * lattice.spacing)
-    begin, end = lattice.window(eye - reach, eye + reach)
+    vertical, reach = int(np.abs(up).argmax()), _reach(up, lattice.spacing)
+    begin, end = lattice.window(middle - reach, middle + reach)
     upside_down = bool(up[vertical] < 0)
     # What is too much for the network is cut off at the top, wherever that is: turned worlds give the same window.
     spare = (end - begin) % STRIDE
     below = np.where((np.arange(3) == vertical) & upside_down, spare, 0)
     begin, end = begin + below, end - (spare - below)
-    seeds = kept_seeds(bricks, *bricks.box(eye - reach - MARGIN, eye + reach + MARGIN))[:, :3]
+    seeds = kept_seeds(bricks, *bricks.box(middle - reach - MARGIN, middle + reach + MARGIN))[:, :3]
     if len(seeds) == 0 or (end <= begin).any():
         return None
     order = [axis for axis in range(3) if axis != vertical] + [vertical]
@@ -86,22 +110,22 @@ def guess(
     lattice: Lattice,
     bricks: BrickVolume,
     network: CompletionNet,
-    eye: Float[np.ndarray, "3"],
+    middle: Float[np.ndarray, "3"],
     up: Float[np.ndarray, "3"],
 ) -> Box | None:
-    """Run the network in a box about the camera and keep its answers in the lattice.
+    """Run the network in a box and keep its answers in the lattice.
 
     Args:
         lattice: its `share` and `width` are changed.
         bricks: the surfaces.
         network: on any device.
-        eye: the camera's position [m].
+        middle: of the box [m], see `middle_of_guesses`.
         up: any vector whose largest component tells the vertical and its sign the way up.
 
     Returns:
         The box [m] that is to be refreshed, or None where there was nothing to go by.
     """
-    around = surroundings(lattice, bricks, eye, up)
+    around = surroundings(lattice, bricks, middle, up)
     if around is None:
         return None
     share, width = (around.in_lattice(answer) for answer in _run(network, features(around.proven)))

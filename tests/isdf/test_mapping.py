@@ -92,6 +92,42 @@ def test_guesses_beat_the_distance_to_what_was_seen():
     assert (field.distance(points) - sdf(points)).abs().mean() < 0.18 * (upper - sdf(points)).abs().mean()
 
 
+@pytest.mark.parametrize(
+    ("eye", "spacing", "middle"),
+    [
+        ((1.4, 0.0, 1.2), 0.16, (1.4, 0.0, 1.2)),
+        ((2.5, 0.0, 1.2), 0.16, (-3.0 + 28 * 0.16, 0.0, 1.2)),
+        ((-2.5, 19.0, 1.2), 0.16, (3.0 - 28 * 0.16, 20.0 - 28 * 0.16, 1.2)),
+        ((2.5, -19.0, 1.2), 0.08, (3.0 - 28 * 0.08, -20.0 + 28 * 0.08, 1.2)),
+    ],
+)
+@pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2, 1)])
+def test_guesses_are_made_about_the_camera_but_where_something_was_seen(eye, spacing, middle, axes):
+    bounds, up = np.array([[-3.0, -20.0, 0.0], [3.0, 20.0, 3.0]]), np.array([0.0, 0.1, -0.9])
+    turned = [np.array(a)[..., axes] for a in (eye, up, bounds, middle)]
+    np.testing.assert_allclose(refresh.middle_of_guesses(*turned[:3], spacing), turned[3], atol=1e-12)
+
+
+def test_a_room_is_guessed_as_a_whole_from_its_corner(monkeypatch):
+    middles = []
+
+    def guess(lattice, bricks, network, middle, up):
+        middles.append(middle)
+        return refresh.guess(lattice, bricks, network, middle, up)
+
+    monkeypatch.setattr("isdf.mapping.mapper.guess", guess)
+    monkeypatch.setattr(refresh, "GUESS_ACROSS", 1.6)
+    mapper, away = Mapper(MapperConfig(guess_period=0.0)), []
+    for frame in furnished_orbit(16)[:8]:
+        mapper.integrate(frame)
+        low, high = mapper.bounds.numpy()[:, :2]
+        below, above = low - (middles[-1][:2] - 1.6), middles[-1][:2] + 1.6 - high
+        assert (((below > -1e-4) & (above > -1e-4)) | ((below < 1e-4) & (above < 1e-4))).all()
+        away.append(np.abs(middles[-1][:2] - frame.T_world_camera.numpy()[:2, 3]).max())
+        assert middles[-1][2] == frame.T_world_camera[2, 3]
+    assert len(middles) == 8 and max(away) > 0.3
+
+
 def test_truth_lies_between_the_bounds(orbit):
     lattice, bricks = orbit.lattice, orbit.bricks
     seeds = surface_seeds(bricks.arrays, *bricks.box(np.full(3, -9.0), np.full(3, 9.0)))[:, :3]
