@@ -120,12 +120,12 @@ class Mapper(ShownMapper):
         box = view_box(depth, *self._band, _intrinsics(frame), T)
         self.bricks.include(box[0], box[1])
         bounds, up = grown(self._bounds, frame, self.config.max_depth), self.up - T[:3, 1]
+        axis, way = vertical(up)
         beyond = np.full(3, BEYOND_ACROSS)
-        beyond[np.abs(up).argmax()] = BEYOND_ALONG
+        beyond[axis] = BEYOND_ALONG
         seen = bounds.numpy().astype(float)
         self.lattice.include(np.minimum(seen[0] - beyond, box[0]), np.maximum(seen[1] + beyond, box[1]))
         self._bounds, self.up = bounds, up
-        axis, way = vertical(up)
         floor = float(seen[0 if way > 0 else 1, axis])
         self.visitors.watch(depth, appeared, stride, _intrinsics(frame), T, up, floor, frame.time)
         self._fuse(depth, T, frame, box, appeared, stride)

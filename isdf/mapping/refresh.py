@@ -16,12 +16,13 @@ from .lattice import FINE, Lattice
 from .nearest import finer_nearest
 from .refinement import cells_to_refine, middle_values, near_known, refined_values
 from .seeds import kept_seeds
+from .standing import vertical
 from .values import Patches, Window, coarse_values
 
 # Surfaces this far outside a window still count in it [m].
 MARGIN = 2.5
-# Box in which distances are guessed: half its sides across and along the vertical [m], and at most so
-# many nodes, so that the network of a fine lattice takes no more memory and time than that of the default one.
+# Box in which distances are guessed: half its sides across and along the vertical [m], and at most so many nodes, so
+# that the network of a fine lattice takes no more memory and time than that of the default one.
 GUESS_ACROSS, GUESS_ALONG = 4.48, 2.56
 NODES_ACROSS, NODES_ALONG = 28, 16
 
@@ -58,7 +59,8 @@ def middle_of_guesses(
 ) -> Float[np.ndarray, "3"]:
     """The middle of the box to guess in [m]: as near to the camera as it can be and hold all of what was seen.
 
-    So a room that fits into the box is guessed as a whole, wherever in it the camera is; of more the box is filled.
+    So a room that fits into the box is guessed as a whole, wherever in it the camera is. Where more was seen than fits,
+    the box lies within it.
 
     Args:
         eye: the camera's position [m].
@@ -66,34 +68,35 @@ def middle_of_guesses(
         bounds: of what was seen [m].
         spacing: of the lattice [m].
     """
-    vertical = np.arange(3) == np.abs(up).argmax()
-    reach = _reach(up, spacing)
+    (axis, _), reach = vertical(up), _reach(up, spacing)
     first, last = np.sort([bounds[0] + reach, bounds[1] - reach], axis=0)
-    return np.where(vertical, eye, np.clip(eye, first, last))
+    middle = np.clip(eye, first, last)
+    middle[axis] = eye[axis]
+    return middle
 
 
 def _reach(up: Float[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "3"]:
     """Half the sides [m] of the box in which distances are guessed."""
-    vertical = np.arange(3) == np.abs(up).argmax()
-    across, along = min(GUESS_ACROSS, NODES_ACROSS * spacing), min(GUESS_ALONG, NODES_ALONG * spacing)
-    return np.where(vertical, along, across)
+    reach = np.full(3, min(GUESS_ACROSS, NODES_ACROSS * spacing))
+    reach[vertical(up)[0]] = min(GUESS_ALONG, NODES_ALONG * spacing)
+    return reach
 
 
 def surroundings(
     lattice: Lattice, bricks: BrickVolume, middle: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
 ) -> Surroundings | None:
     """What the network goes by; None where there is nothing. Arguments as for `guess`."""
-    vertical, reach = int(np.abs(up).argmax()), _reach(up, lattice.spacing)
+    (axis, way), reach = vertical(up), _reach(up, lattice.spacing)
     begin, end = lattice.window(middle - reach, middle + reach)
-    upside_down = bool(up[vertical] < 0)
+    upside_down = way < 0
     # What is too much for the network is cut off at the top, wherever that is: turned worlds give the same window.
     spare = (end - begin) % STRIDE
-    below = np.where((np.arange(3) == vertical) & upside_down, spare, 0)
+    below = np.where((np.arange(3) == axis) & upside_down, spare, 0)
     begin, end = begin + below, end - (spare - below)
     seeds = kept_seeds(bricks, *bricks.box(middle - reach - MARGIN, middle + reach + MARGIN))[:, :3]
     if len(seeds) == 0 or (end <= begin).any():
         return None
-    order = [axis for axis in range(3) if axis != vertical] + [vertical]
+    order = [across for across in range(3) if across != axis] + [axis]
     evidence, corner, seeds = (
         lattice.read("evidence", begin, end).transpose(order),
         (lattice.corner + begin)[order],
