@@ -28,6 +28,8 @@ ROOM = 0.12
 """Clearance [m] of starts and goals."""
 APART = 4.0
 """Least straight distance between start and goal [m]."""
+BESIDE_PEOPLE = 0.1
+"""Gap that people leave to walls and furniture [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +93,7 @@ def make_tasks(options: Navigate) -> list[NavigationTask]:
     scene = load_urdf_scene(options.scene) if options.scene.endswith(".urdf") else make_scene(options.scene)
     floor = FreeFloor.of(scene, RADIUS)
     places = floor.places(ROOM)
+    walked = people_places(scene) if options.disturb == "people" else ()
     name = Path(options.scene).stem
     folder = options.out / name / options.method / options.disturb
     tasks: list[NavigationTask] = []
@@ -113,12 +116,18 @@ def make_tasks(options: Navigate) -> list[NavigationTask]:
                 (float(goal[0]), float(goal[1])),
                 floor.shortest(start, goal),
                 _furniture(scene, floor, start, goal, rng) if options.disturb == "moved" else None,
-                tuple(map(tuple, places.tolist())) if options.disturb == "people" else (),
+                walked,
             )
         )
     if len(tasks) < options.episodes:
         raise SystemExit(f"{options.scene}: only {len(tasks)} starts and goals {APART:g} m apart were found")
     return tasks
+
+
+def people_places(scene: Scene) -> tuple[tuple[float, float], ...]:
+    """Where people walk: they are narrower than the robot, and get past it where it cannot pass."""
+    floor = FreeFloor.of(scene, People.RADIUS, heights=(0.06, People.HEIGHT))
+    return tuple(map(tuple, floor.places(BESIDE_PEOPLE).tolist()))
 
 
 def _furniture(

@@ -355,8 +355,7 @@ class BasePlanner:
         deepest = centres[clearance.argmin()]
         if clearance.min() >= self.config.search.least_margin or not bool(sdf.by_what_came(deepest)):
             return None
-        distance, gradient = sdf.distance_and_gradient(deepest)
-        return (deepest - distance * gradient)[:2]
+        return sdf.nearest_surface(deepest)[:2]
 
 
 def _until(route: Route, off: float) -> Route:

@@ -88,8 +88,12 @@ class ExploredField:
         """At which points [m] the nearest surface was seen; at all in fields that do not tell how sure they are."""
         if not isinstance(self.field, ConfidentField):
             return torch.ones(points.shape[:-1], dtype=torch.bool)
+        return self.field.confidence(self.nearest_surface(points)) >= SEEN
+
+    def nearest_surface(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Where the surface is that is nearest to points [m]."""
         distance, gradient = self.field.distance_and_gradient(points)
-        return self.field.confidence(points.detach() - distance.unsqueeze(-1) * gradient) >= SEEN
+        return _on_surface(points, distance, _direction(gradient))
 
     @property
     def _is_wary(self) -> bool:
@@ -101,13 +105,22 @@ class ExploredField:
 
     def _came(self, points: Tensor, distance: Tensor, gradient: Tensor) -> Bool[Tensor, "*batch"]:
         assert isinstance(self.field, ChangingField)
-        came = self.field.came(points.detach() - distance.unsqueeze(-1) * gradient)
-        return came & (gradient[..., 2] <= MIN_FLOOR_SLOPE)
+        away = _direction(gradient)
+        return self.field.came(_on_surface(points, distance, away)) & (away[..., 2] <= MIN_FLOOR_SLOPE)
 
     def _observed(self, points: Tensor) -> Bool[Tensor, "*batch"]:
         if isinstance(self.field, ObservingField):
             return self.field.observed(points)
         return self.field.confidence(points) >= SEEN
+
+
+def _direction(gradient: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Away from the nearest surface. Inside of thin things the gradients of a map are several times too long."""
+    return torch.nn.functional.normalize(gradient, dim=-1)
+
+
+def _on_surface(points: Tensor, distance: Tensor, away: Tensor) -> Float[Tensor, "*batch 3"]:
+    return points.detach() - distance.unsqueeze(-1) * away
 
 
 @njit(cache=True, nogil=True)

@@ -164,6 +164,12 @@ def test_people_walk_in_free_space_and_wait_for_the_robot() -> None:
     assert gaps.min() > 2 * People.RADIUS
 
 
+def test_people_walk_where_people_fit_and_not_only_where_the_robot_does() -> None:
+    to_west = np.array(navigation_episodes.people_places(hall()))[:, 0].min() + 3.0
+    alone = People.RADIUS + navigation_episodes.BESIDE_PEOPLE
+    assert alone - 0.01 <= to_west <= alone + 0.11 < navigation_episodes.RADIUS + navigation_episodes.ROOM
+
+
 def test_people_walk_from_place_to_place_through_passages() -> None:
     axis = np.arange(-2, 2.05, 0.1)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)

@@ -283,6 +283,23 @@ def test_what_came_counts_as_nearer() -> None:
     assert torch.equal(ExploredField(field, trodden()).distance(points), field.distance(points))
 
 
+@dataclass
+class Steep(Visited):
+    """Gradients are three times too long, as inside of thin things in a map."""
+
+    def distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        distance, gradient = super().distance_and_gradient(points)
+        return distance, 3 * gradient
+
+
+def test_the_nearest_surface_is_found_however_long_gradients_are() -> None:
+    wall = Box((2.0, 0.0, 0.5), (0.2, 9.0, 9.0))
+    explored = ExploredField(Steep(wall, *EVERYWHERE, limit=1.7), trodden())
+    inside = torch.tensor([[1.9, 0.1, 0.5]])
+    torch.testing.assert_close(explored.nearest_surface(inside), torch.tensor([[1.8, 0.1, 0.5]]))
+    assert explored.by_what_came(inside).all(), "all of somebody counts as what came, not only his rim"
+
+
 GAP = Union(Box((2.0, 5.3, 0.5), (0.15, 5.0, 1.0)), Box((2.0, -5.3, 0.5), (0.15, 5.0, 1.0)))
 """60 cm between two walls, for a base of 50 cm."""
 
