@@ -87,15 +87,27 @@ class Train:
     """Greatest learning rate."""
     start: Path | None = None
     """Weights to go on from."""
+    keep: float = 0.0
+    """Share of the weights to start from in those that are written: of rooms unlike those of the windows the mean of
+    both may know more."""
     judge: bool = False
     """Only judge the weights to start from."""
+
+    def __post_init__(self) -> None:
+        """Refuse a share that is none, or is one of nothing."""
+        if not 0 <= self.keep < 1 or (self.keep > 0 and self.start is None):
+            raise SystemExit(
+                f"--keep must be at least 0 and below 1, and above 0 only with --start, got {self.keep:g}"
+            )
+        if self.start == self.out and self.keep > 0:
+            raise SystemExit("--keep needs the weights of --start to the end: give another file as --out")
 
     def run(self) -> None:
         """Every 25th room is left out and tells the error of windows never trained on."""
         torch.manual_seed(0)
         net = CompletionNet().to(memory_format=torch.channels_last_3d)
         if self.start is not None:
-            net.load_state_dict({k: v.float() for k, v in load_file(self.start).items()})
+            net.load_state_dict(weights_of(self.start))
         if self.judge:
             print(judged(net, self.files(held=True)))
             return
@@ -119,16 +131,26 @@ class Train:
                 print(judged(net, self.files(held=True)), flush=True)
                 self.save(net)
         self.save(net)
-        print(judged(net, self.files(held=True)), flush=True)
+        net.load_state_dict(weights_of(self.out))
+        print(f"as written:\n{judged(net, self.files(held=True))}", flush=True)
 
     def files(self, held: bool) -> list[Path]:
         """Windows to learn from, or those held out."""
         return [f for f in sorted(self.data.glob("*.safetensors")) if (int(f.name[:5]) % 25 == 0) == held]
 
     def save(self, net: CompletionNet) -> None:
-        """Write the weights."""
+        """Write the weights, drawn back towards those that training began from if these are to `keep` a share."""
+        weights = net.state_dict()
+        if self.start is not None:
+            begun = weights_of(self.start)
+            weights = {name: torch.lerp(value, begun[name], self.keep) for name, value in weights.items()}
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        save_file({k: v.half().contiguous() for k, v in net.state_dict().items()}, self.out)
+        save_file({name: value.half().contiguous() for name, value in weights.items()}, self.out)
+
+
+def weights_of(path: Path) -> dict[str, torch.Tensor]:
+    """Weights from a file, in single precision."""
+    return {name: value.float() for name, value in load_file(path).items()}
 
 
 def load(path: Path) -> Window:

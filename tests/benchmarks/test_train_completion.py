@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
+import torch
 from safetensors.torch import load_file
 
 from benchmarks.camera_ways import camera_way
@@ -57,3 +59,17 @@ def test_a_network_is_trained_from_windows_on_disk(tmp_path: Path):
     assert all(bool(value.isfinite().all()) for value in weights.values())
     assert any(not value.equal(untrained[name]) for name, value in weights.items())
     Train(tmp_path / "windows", out, start=out, judge=True).run()
+
+
+def test_what_is_written_keeps_a_share_of_what_training_began_from(tmp_path: Path):
+    torch.manual_seed(1)
+    begun, trained = CompletionNet(), CompletionNet()
+    start, out = tmp_path / "start.safetensors", tmp_path / "out.safetensors"
+    Train(tmp_path, start).save(begun)
+    Train(tmp_path, out, start=start, keep=0.25).save(trained)
+    written, b, t = load_file(out), begun.state_dict(), trained.state_dict()
+    for name, value in written.items():
+        torch.testing.assert_close(value.float(), 0.25 * b[name] + 0.75 * t[name], atol=1e-3, rtol=1e-3)
+    for options in ({"keep": 0.5}, {"keep": 1.0, "start": start}, {"keep": 0.5, "start": out}):
+        with pytest.raises(SystemExit, match="keep"):
+            Train(tmp_path, out, **options)
