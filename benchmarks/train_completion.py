@@ -94,12 +94,12 @@ class Train:
     """Only judge the weights to start from."""
 
     def __post_init__(self) -> None:
-        """Refuse a share that is none, or is one of nothing."""
+        """Refuse a share that is none, or is of weights that are not there to the end."""
         if not 0 <= self.keep < 1 or (self.keep > 0 and self.start is None):
             raise SystemExit(
                 f"--keep must be at least 0 and below 1, and above 0 only with --start, got {self.keep:g}"
             )
-        if self.start == self.out and self.keep > 0:
+        if self.keep > 0 and self.start is not None and self.start.resolve() == self.out.resolve():
             raise SystemExit("--keep needs the weights of --start to the end: give another file as --out")
 
     def run(self) -> None:
@@ -141,7 +141,7 @@ class Train:
     def save(self, net: CompletionNet) -> None:
         """Write the weights, drawn back towards those that training began from if these are to `keep` a share."""
         weights = net.state_dict()
-        if self.start is not None:
+        if self.start is not None and self.keep > 0:
             begun = weights_of(self.start)
             weights = {name: torch.lerp(value, begun[name], self.keep) for name, value in weights.items()}
         self.out.parent.mkdir(parents=True, exist_ok=True)

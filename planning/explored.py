@@ -120,6 +120,7 @@ def _direction(gradient: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]
 
 
 def _on_surface(points: Tensor, distance: Tensor, away: Tensor) -> Float[Tensor, "*batch 3"]:
+    """Where the nearest surface is [m], whose direction is opposite to `away`."""
     return points.detach() - distance.unsqueeze(-1) * away
 
 
