@@ -54,7 +54,7 @@ class GridSearchConfig:
     through_blocked: float = math.inf
     through_unknown: float = math.inf
     through_guessed: float = math.inf
-    through_passing: float = 2.0
+    through_passing: float = 1.5
     closed_radius: float = 0.6
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
 

@@ -14,7 +14,7 @@ from planning.drive import DriveStatus
 from planning.grid_search import grid_search
 from planning.once_free import OnceFree
 from planning.position_costs import GridSearchConfig
-from planning.vain_looks import LONG
+from planning.vain_looks import LONG, OUT_OF_WAY
 from tests.planning.fields import Box, Cylinder, Union
 from tests.planning.robots import Disc
 from tests.planning.test_replanning import BODY, FREE, QUICK, drive
@@ -127,9 +127,7 @@ class Passage(Union):
 @pytest.mark.parametrize("came", [True, False])
 @pytest.mark.parametrize("before", [True, False])
 def test_who_came_into_the_way_is_waited_for_though_there_is_a_way_round(came: bool, before: bool) -> None:
-    config = BasePlannerConfig()
-    config = replace(config, search=replace(config.search, through_passing=1.5))
-    planner, person = BasePlanner(BODY, config), Box((2.0, 0.0, 0.5), (0.2, 0.5, 1.0))
+    planner, person = BasePlanner(BODY), Box((2.0, 0.0, 0.5), (0.2, 0.5, 1.0))
     if before:
         assert planner.plan(START, GOAL, Passage(WALL)).reaches_goal
     plan = planner.plan(START, GOAL, Passage(WALL, person, came=came), now=1.0)
@@ -137,6 +135,23 @@ def test_who_came_into_the_way_is_waited_for_though_there_is_a_way_round(came: b
     if came:
         assert plan.blocker is not None and plan.came
         assert float(person.distance(torch.tensor([*plan.blocker.tolist(), 0.5])).abs()) < 0.1
+
+
+def test_who_came_is_waited_for_rather_than_unknown_space_entered_beside_him() -> None:
+    """Between x = 1 and 3 somebody is everywhere up to y = 0; what is beyond that is unknown, and so is the goal."""
+
+    class Beside(Box):
+        def observed(self, points: torch.Tensor) -> torch.Tensor:
+            known = (points[..., 1] < 0.0) | ((points[..., 0] - 2.0).abs() > 1.0)
+            return known & (points[..., 0] < 4.0)
+
+        def came(self, points: torch.Tensor) -> torch.Tensor:
+            return torch.ones(points.shape[:-1], dtype=torch.bool)
+
+    start, goal = torch.tensor([-1.0, 0.9]), torch.tensor([5.0, 0.9])
+    plan = BasePlanner(BODY).plan(start, goal, Beside((2.0, -30.0, 0.5), (1.0, 30.0, 1.0)))
+    onward = plan.onward[(plan.onward[:, 0] - 2.0).abs() < 0.9, 1]
+    assert plan.usable and len(onward) and float(onward.max()) < 0.3
 
 
 class Ring(Disc):
@@ -160,9 +175,7 @@ def test_who_stands_in_a_gap_too_narrow_for_the_base_is_not_waited_for(half_widt
         def came(self, points: torch.Tensor) -> torch.Tensor:
             return person.distance(points).abs() < 0.005
 
-    config = BasePlannerConfig()
-    config = replace(config, search=replace(config.search, through_passing=1.5))
-    plan = BasePlanner(Ring(radius=0.25), config).plan(START, GOAL, Gap(*jambs, person))
+    plan = BasePlanner(Ring(radius=0.25)).plan(START, GOAL, Gap(*jambs, person))
     assert plan.usable and plan.came == (not plan.reaches_goal) == (half_width > 0.3)
 
 
@@ -237,7 +250,7 @@ def test_it_waits_where_it_shuts_in_nobody(shut_in: bool) -> None:
     planner.plan(far, goal, Entered(walls))
     plan, route = planner.plan(far, goal, occupied, now=1.0), planner.route(far, goal, occupied)
     end = plan.result.trajectory.waypoints[-1]
-    assert plan.usable and route.grid.room(route.onward, end, 1.2) > 20.0
+    assert plan.usable and route.grid.room(route.onward, end, OUT_OF_WAY) > 20.0
     assert (float((end - plan.onward[0]).norm()) < 1.2) != shut_in
     assert not planner.leads_on(planner.route(end, goal, occupied), occupied, 2.0)
 
