@@ -3,6 +3,8 @@
     python -m examples.record_sequences --out runs/sequences
     python -m benchmarks.realtime --sequences runs/sequences --out runs/realtime
 
+"seen" is no map, but how well any could do that guesses nothing: exact distances to the surface in noise-free images.
+
 One line a sequence and method: SDF error in the visible region at the end, mean over the sequence, below 0.3 m true
 distance, in free space more than 25 cm from anything seen and that over the exact-distance map's; cosine distance of
 the gradient, CHOMP cost error, share of visible points overestimated by more than 5 cm; area under the ROC curve of
@@ -38,7 +40,7 @@ from benchmarks.realtime_report import Reliability, save_reliability, table, tar
 from benchmarks.stages import map_stages
 from isdf import IsdfConfig, MapperConfig
 from isdf.datasets import DepthSequence, open_sequence
-from isdf.evaluation import Truth, VisibleRegion, evaluate, roc_area, unseen_points
+from isdf.evaluation import SeenSurface, Truth, VisibleRegion, evaluate, roc_area, unseen_points
 from isdf.methods import Config, OnlineMapper
 from isdf.runner import Begun, RunReport, run_at_rate
 from isdf.voxel import ExactConfig, KinectFusionConfig, VoxbloxConfig
@@ -46,6 +48,7 @@ from robots.simulation import load_truth
 
 NEAR = 0.3
 REFERENCE = "exact"
+FLOOR = "seen"
 METHODS: dict[str, Config] = {
     "exact": ExactConfig(),
     "default": MapperConfig(),
@@ -68,7 +71,11 @@ class Realtime:
     """Folder for the figures."""
     only: tuple[str, ...] = ()
     """Names of the sequences to take; all if empty."""
-    methods: tuple[Literal["exact", "default", "kinectfusion", "voxblox", "isdf"], ...] = ("exact", "default")
+    methods: tuple[Literal["seen", "exact", "default", "kinectfusion", "voxblox", "isdf"], ...] = (
+        "seen",
+        "exact",
+        "default",
+    )
     """The exact-distance map comes first: the others are compared with it."""
     points: int = 50_000
     """Evaluation points at the end; a tenth of them at the other times."""
@@ -110,7 +117,7 @@ class Judge:
         self.options, self.name = options, name
         self.sequence: DepthSequence = open_sequence(folder)
         clean, self.truth = open_sequence(folder / "noise_free"), load_truth(folder / "truth.json")
-        self.region = VisibleRegion(clean)
+        self.clean, self.region = clean, VisibleRegion(clean)
         self.visible = Truth.of(
             self.truth.field, self.region.points(len(self.sequence) - 1, options.points, seed=99)
         )
@@ -134,21 +141,12 @@ class Judge:
         begun = Begun(ages.report)
         mapper, report = run_at_rate(sequence, config, options.cpu_per_second, watch, begun)
         found = mapper.field()
-        scores, near = (
-            evaluate(found, self.visible),
-            evaluate(found, self.visible.where(self.visible.distance < NEAR)),
-        )
+        scores = self._scores(found)
         unseen = 100 * (evaluate(found, self.hidden).sdf_error or float("nan"))
-        end = 100 * (scores.sdf_error or float("nan"))
-        return {
-            "end": end,
-            "mean": float(np.mean([*(100 * e for e in errors), end])),
-            "near": 100 * (near.sdf_error or float("nan")),
+        return scores | {
+            "mean": float(np.mean([*(100 * e for e in errors), scores["end"]])),
             "unseen": unseen,
             "ratio": unseen / reference if reference else None,
-            "1-cos": scores.gradient_distance,
-            "cost": scores.cost_error,
-            "over": scores.overestimated,
             "CPU": report.cpu_seconds / report.sequence_seconds,
             "frames": report.frames_used / report.frames,
             "refused": len(report.frames_refused),
@@ -157,6 +155,23 @@ class Judge:
             "age": max(ages.seen),
             **self._confidence(found, reliability),
             **self._speed(found),
+        }
+
+    def floor(self) -> dict[str, Any]:
+        """The columns of the visible region, of exact distances to all surface that was seen, without noise."""
+        surface = SeenSurface(self.clean, self.truth.field)
+        return dict.fromkeys(COLUMNS.split()) | self._scores(surface)
+
+    def _scores(self, found: Any) -> dict[str, Any]:
+        """Errors in the visible region at the end."""
+        nan, close = float("nan"), self.visible.where(self.visible.distance < NEAR)
+        scores, near = evaluate(found, self.visible), evaluate(found, close)
+        return {
+            "end": 100 * (scores.sdf_error or nan),
+            "near": 100 * (near.sdf_error or nan),
+            "1-cos": scores.gradient_distance,
+            "cost": scores.cost_error,
+            "over": scores.overestimated,
         }
 
     def _seen(self, last: int, seed: int) -> Truth:
@@ -206,7 +221,12 @@ def main(options: Realtime) -> None:
         judge, reference = Judge(options, name), None
         rows[name] = {}
         for method in sorted(options.methods, key=lambda m: m != REFERENCE):
-            row = rows[name][method] = judge.row(METHODS[method], reference, reliability[method])
+            row = (
+                judge.floor()
+                if method == FLOOR
+                else judge.row(METHODS[method], reference, reliability[method])
+            )
+            rows[name][method] = row
             reference = row["unseen"] if method == REFERENCE else reference
             cells = " ".join(f"{row[c]:7.3f}" if row[c] is not None else f"{'-':>7}" for c in COLUMNS.split())
             print(f"{name:>10} {method:>12} {cells}", flush=True)

@@ -22,6 +22,7 @@ NAMES = {
     "fiesta": "FIESTA",
     "kinectfusion": "KinectFusion+",
     "exact": "exact distances",
+    "seen": "all surface seen, without noise",
     "isdf ray": "ray",
     "isdf normal": "normal",
     "isdf batch": "batch",

@@ -44,7 +44,7 @@ class EpisodeOptions:
     out: Path
     """Folder for the report and pictures."""
     scene: str = "apartment"
-    """A furnished room (apartment, office, flat, home_1, home_2) or the path of a .urdf scene."""
+    """A furnished room (apartment, office, flat, home_1 to home_3) or the path of a .urdf scene."""
     seed: int = 0
     """Shifts the furniture, picks start and goal, and seeds map, noise and search."""
     noise: bool = True

@@ -1,4 +1,4 @@
-"""The six tours of the two homes: exploring (nav), looking at two large objects (obj), going to grasp (mnp)."""
+"""The nine tours of three homes: exploring (nav), looking at two large objects (obj), going to grasp (mnp)."""
 
 from __future__ import annotations
 
@@ -70,5 +70,24 @@ TOURS: dict[str, HomeTour] = {
         ),
     ),
     "apt_2_mnp": HomeTour("home_2", (0.4, -0.3, 1.8), _reach((-0.7, 2.03), final_yaw=math.pi / 2)),
+    "apt_3_nav": HomeTour(
+        "home_3",
+        (0.2, -1.5, math.pi / 2),
+        _explore(
+            ((0.1, 0.0), (-2.6, 0.1)),
+            ((-0.2, 0.2), (0.0, 1.6), (1.5, 1.75)),
+            ((0.2, 1.2), (0.6, -0.1), (2.4, -0.1)),
+            ((2.1, -1.2),),
+        ),
+    ),
+    "apt_3_obj": HomeTour(
+        "home_3",
+        (0.1, -1.7, 2.8),
+        (
+            Leg(((0.0, -0.4), (-1.0, 0.1), (-2.5, 0.0)), "sofa", speed=0.4, wander=0.4),
+            Leg(((-1.7, 0.1), (-0.3, 0.6), (-0.3, 2.0)), "dining_table", speed=0.4),
+        ),
+    ),
+    "apt_3_mnp": HomeTour("home_3", (0.0, 1.2, -1.5), _reach((0.28, -1.73), final_yaw=-math.pi / 2)),
 }
 """By sequence name."""

@@ -1,4 +1,4 @@
-"""Record six synthetic sequences like the paper's: two furnished homes, each explored, looked at, and reached into.
+"""Record synthetic sequences like the paper's: three furnished homes, each explored, looked at, and reached into.
 
     python -m examples.record_sequences --out runs/sequences
     python -m examples.record_sequences --out runs/sequences --only apt_1_nav apt_2_mnp
@@ -36,7 +36,7 @@ STILL = 1e-3
 
 @dataclass(frozen=True)
 class RecordSequences:
-    """Record the six synthetic sequences."""
+    """Record the nine synthetic sequences."""
 
     out: Path
     """Folder for the sequences, each in a folder of its name."""

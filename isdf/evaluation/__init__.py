@@ -3,6 +3,7 @@
 from .metrics import BINS, Scores, evaluate, roc_area
 from .points import VisibleRegion, observed_voxels, unseen_points
 from .rays import Rays, RayScores, draw_rays, evaluate_rays, first_zero
+from .seen_surface import SeenSurface
 from .split import Part, hold_out
 from .truth import GRADIENT_STEP, Truth, central_differences
 
@@ -13,6 +14,7 @@ __all__ = [
     "RayScores",
     "Rays",
     "Scores",
+    "SeenSurface",
     "Truth",
     "VisibleRegion",
     "central_differences",

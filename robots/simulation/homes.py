@@ -1,4 +1,4 @@
-"""Two furnished homes under a ceiling, of the size and density of ReplicaCAD's apartments (iSDF section 5)."""
+"""Furnished homes under a ceiling, of the size and density of ReplicaCAD's apartments (iSDF section 5)."""
 
 from __future__ import annotations
 
@@ -124,8 +124,63 @@ def _kitchen_2(layout: Layout) -> None:
     put(fn.bag("bag"), -1.65, 2.98, shift=0.03)
 
 
+def _home_3(layout: Layout) -> None:
+    _enclose(layout, 1.3, -layout.size[1] / 2, -0.7)
+    _living_room_3(layout)
+    _kitchen_3(layout)
+    _study_3(layout)
+    layout.put_grasp_table(0.35, "south")
+
+
+def _living_room_3(layout: Layout) -> None:
+    put, by_wall = layout.put, layout.put_by_wall
+    by_wall(fn.television("television"), -1.3, "west", 0.4)
+    put(fn.sofa("sofa", 2.0, fn.GREY), -1.0, -1.3, -QUARTER)
+    coffee = put(fn.round_table("coffee_table", 0.38, 0.42), -2.3, -1.3)
+    layout.drop(coffee, 0.42, bowl("coffee_bowl"), 0.1, 0.0)
+    put(fn.armchair("armchair", fn.GREEN), -2.35, -2.4, np.pi, shift=0.03)
+    put(fn.floor_lamp("lamp"), -1.45, -2.68, shift=0.03)
+    put(fn.plant("plant0"), -3.28, -2.58, shift=0.03)
+    dining = put(fn.table("dining_table", 1.5, 0.85, 0.74, fn.DARK_WOOD), -1.7, 1.35)
+    south, north = (-0.55, np.pi), (0.55, 0.0)
+    layout.put_chairs("chair", dining, [(-0.37, *south), (0.37, *south), (-0.37, *north), (0.37, *north)])
+    layout.put_on(dining, 0.74, fn.vase("dining_table.vase"), -0.3, 0.0)
+    layout.drop(dining, 0.74, bowl("fruit_bowl"), 0.2, 0.05)
+    put(fn.pendant("pendant", layout.size[2]), -1.7, 1.35)
+    sideboard = by_wall(fn.cupboard("sideboard", 1.3, 0.85), -1.7, "north", 0.45)
+    layout.put_on(sideboard, 0.85, fn.table_lamp("sideboard.lamp"), 0.4, 0.02)
+    by_wall(fn.picture("picture0", 1.1, 0.7), -1.7, "north", 0.03)
+    case = by_wall(fn.shelf("shelf", 1.2, 1.8, boards=5), 1.7, "west", 0.32)
+    fill_shelf(layout, "shelf", case, [0.085, 0.51, 0.94, 1.37], 1.1)
+
+
+def _kitchen_3(layout: Layout) -> None:
+    put, by_wall = layout.put, layout.put_by_wall
+    counter = by_wall(fn.counter("counter", 2.4), 1.85, "north", 0.6)
+    layout.drop(counter, 0.9, can("counter_can"), -0.7, 0.0)
+    by_wall(fn.cupboard("fridge", 0.62, 1.9, 0.6), 1.75, "east", 0.63)
+    island = put(fn.island("island", 1.3), 1.5, 0.9)
+    layout.drop(island, 0.9, bowl("island_bowl"), 0.3, 0.0)
+    for i, x in enumerate((-0.32, 0.32)):
+        put(fn.stool(f"stool{i}"), 1.5 + x, 0.38)
+    put(fn.bin_("bin"), 0.4, 2.68, shift=0.03)
+
+
+def _study_3(layout: Layout) -> None:
+    put, by_wall = layout.put, layout.put_by_wall
+    desk = by_wall(fn.table("desk", 1.2, 0.6, 0.74, fn.WHITE), -1.7, "east", 0.6)
+    layout.put_on(desk, 0.74, fn.monitor("monitor"), -0.1, 0.12)
+    layout.drop(desk, 0.74, parcel("desk_parcel"), 0.4, 0.0)
+    put(fn.office_chair("office_chair"), 2.65, -1.7, -QUARTER, turn=15.0)
+    case = by_wall(fn.shelf("bookcase", 1.0, 1.6), 2.1, "south", 0.32)
+    fill_shelf(layout, "bookcase", case, [0.085, 0.59, 1.1], 0.9)
+    by_wall(fn.picture("picture1", 0.8, 0.6), -1.7, "east", 0.03)
+    put(fn.plant("plant1"), 3.25, -2.55, shift=0.03)
+
+
 HOMES: dict[str, tuple[tuple[float, float, float], Callable[[Layout], None]]] = {
     "home_1": ((8.0, 6.0, 2.8), _home_1),
     "home_2": ((7.6, 6.4, 2.8), _home_2),
+    "home_3": ((7.2, 5.8, 2.6), _home_3),
 }
 """By scene name: free width, depth and height [m], and the function that furnishes the home."""

@@ -13,6 +13,7 @@ from isdf.datasets import SequenceWriter, open_sequence
 from isdf.errors import EvaluationError
 from isdf.evaluation import (
     BINS,
+    SeenSurface,
     Truth,
     VisibleRegion,
     draw_rays,
@@ -194,6 +195,26 @@ def test_a_room_seen_from_the_middle_all_round_has_no_unseen_points_in_the_open(
     room, seen = torch.tensor([[-1.0, -1, 0], [1, 1, 2]]), open_sequence(tmp_path / "s")
     assert float(observed_voxels(seen, room, 0.1).float().mean()) > 0.95
     assert len(unseen_points(seen, Analytic(sdf), room, 100, seed=0)) == 0
+
+
+def test_the_seen_surface_is_exact_where_it_was_seen_and_never_too_near(sequence, truth) -> None:
+    seen = SeenSurface(sequence, Analytic(ROOM), stride=1)
+    inside = truth.distance < 0
+    assert bool((seen.distance(truth.points)[inside] < 0).all()) and bool(inside.any())
+    assert bool((seen.distance(truth.points).abs() > truth.distance.abs() - 1e-3).all())
+    for i in (0, 5):
+        frame = sequence[i]
+        eye, surface = frame.T_world_camera[:3, 3].float(), frame.thinned(1, 12.0)
+        before = surface + 0.05 * (eye - surface) / (eye - surface).norm(dim=1, keepdim=True)
+        error = seen.distance(before) - ROOM(before)
+        assert float(error.max()) < 0.04 and float(error.mean()) < 0.006
+    hidden = unseen_points(sequence, Analytic(ROOM), BOX, 200, seed=0)
+    assert float((seen.distance(hidden) - ROOM(hidden)).mean()) > 0.3
+
+
+def test_a_surface_that_no_frame_shows_is_refused(sequence) -> None:
+    with pytest.raises(EvaluationError, match=r"no frame shows a surface within 0\.2 m"):
+        SeenSurface(sequence, Analytic(ROOM), max_depth=0.2)
 
 
 def test_held_out_frames_are_not_mapped_and_the_clock_is_kept(sequence) -> None:

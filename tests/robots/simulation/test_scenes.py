@@ -10,7 +10,7 @@ from robots.simulation import Scene, SceneField, Sphere, available_scenes, load_
 from robots.simulation.free_space import floor_map
 
 SCENES = [(name, seed) for name in ("apartment", "office") for seed in range(10)]
-SCENES += [(name, seed) for name in ("flat", "home_1", "home_2") for seed in range(3)]
+SCENES += [(name, seed) for name in ("flat", "home_1", "home_2", "home_3") for seed in range(3)]
 
 
 def _column_clearance(field: SceneField, places: np.ndarray) -> np.ndarray:
