@@ -71,5 +71,5 @@ def test_finished_is_kept_and_interrupted_starts_anew(folder, monkeypatch) -> No
 
 
 def test_unknown_names_list_the_known(tmp_path) -> None:
-    with pytest.raises(SystemExit, match="no sequence named apt_3_nav; choose from apt_1_nav, apt_1_obj"):
-        RecordSequences(tmp_path, only=("apt_3_nav",))
+    with pytest.raises(SystemExit, match="no sequence named apt_9_nav; choose from apt_1_nav, apt_1_obj"):
+        RecordSequences(tmp_path, only=("apt_9_nav",))
