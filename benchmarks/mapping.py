@@ -30,6 +30,7 @@ if not __package__:  # run as a file
 
 from benchmarks.experiments import EXPERIMENTS, REAL, REGION_OF, Experiment, Job
 from benchmarks.runs import REAL_FPS, Study, prepare, run, write_json
+from benchmarks.sequences import chosen
 from benchmarks.workers import Workers, at_work
 
 logger = logging.getLogger(__name__)
@@ -89,19 +90,13 @@ def main(options: Options) -> list[str]:
 
 def _jobs(study: Study, options: Options, name: Experiment) -> list[Job]:
     """The jobs of one experiment that the options ask for."""
-    folder, mark, advice = study.sequences, "truth.json", "run `python -m examples.record_sequences` first"
-    if name == REAL:
-        if study.data is None:
-            raise SystemExit("the real sequences are not here: give --data or set ISDF_DATA_DIR")
-        folder, mark, advice = study.data, "poses.txt", "give --data the folder that has them"
-    there = sorted(
-        p.parent.name for p in folder.glob(f"*/{mark}") if name != REAL or p.parent.name in REAL_FPS
-    )
-    names = list(options.only) or there
-    if not names or set(names) - set(there):
-        lacking = ", ".join(sorted(set(names) - set(there))) or "any"
-        raise SystemExit(
-            f"{folder}: no sequence {lacking} with a {mark}, only {', '.join(there) or 'none'}; {advice}"
+    if name != REAL:
+        names = chosen(study.sequences, options.only)
+    elif study.data is None:
+        raise SystemExit("the real sequences are not here: give --data or set ISDF_DATA_DIR")
+    else:
+        names = chosen(
+            study.data, options.only, REAL_FPS, "poses.txt", "give --data the folder that has them"
         )
     jobs = EXPERIMENTS[name](names, options.seeds)
     labels = sorted({job.method for job in jobs})

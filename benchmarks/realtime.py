@@ -37,6 +37,7 @@ if not __package__:  # run as a file
 
 from benchmarks.publishing import publish
 from benchmarks.realtime_report import Reliability, save_reliability, table, target_lines
+from benchmarks.sequences import chosen
 from benchmarks.stages import map_stages
 from isdf import IsdfConfig, MapperConfig
 from isdf.datasets import DepthSequence, open_sequence
@@ -126,7 +127,7 @@ class Judge:
         self.hidden = Truth.of(self.truth.field, hidden)
         self.passing: dict[int, Truth] = {}
 
-    def row(self, config: Config, reference: float | None, reliability: Reliability) -> dict[str, Any]:
+    def row(self, method: str, reference: float | None, reliability: Reliability) -> dict[str, Any]:
         """Map the sequence with one method; returns the columns."""
         options, sequence = self.options, self.sequence
         errors, due, ages = [], [options.period], Ages(options.cpu_per_second)
@@ -139,7 +140,7 @@ class Judge:
                 errors.append(float((mapper.field().distance(seen.points) - seen.distance).abs().mean()))
 
         begun = Begun(ages.report)
-        mapper, report = run_at_rate(sequence, config, options.cpu_per_second, watch, begun)
+        mapper, report = run_at_rate(sequence, METHODS[method], options.cpu_per_second, watch, begun)
         found = mapper.field()
         scores = self._scores(found)
         unseen = 100 * (evaluate(found, self.hidden).sdf_error or float("nan"))
@@ -211,7 +212,7 @@ def rate(found: Any, points: Tensor) -> float:
 def main(options: Realtime) -> None:
     """Print the tables and write them down."""
     torch.set_num_threads(1)
-    names = options.only or tuple(sorted(p.parent.name for p in options.sequences.glob("*/truth.json")))
+    names = chosen(options.sequences, options.only)
     options.out.mkdir(parents=True, exist_ok=True)
     print("errors in cm; 1-cos, cost, over and auc as numbers; see the module's text for the columns")
     print(f"{'sequence':>10} {'method':>12} " + " ".join(f"{c:>7}" for c in COLUMNS.split()))
@@ -221,11 +222,7 @@ def main(options: Realtime) -> None:
         judge, reference = Judge(options, name), None
         rows[name] = {}
         for method in sorted(options.methods, key=lambda m: m != REFERENCE):
-            row = (
-                judge.floor()
-                if method == FLOOR
-                else judge.row(METHODS[method], reference, reliability[method])
-            )
+            row = judge.floor() if method == FLOOR else judge.row(method, reference, reliability[method])
             rows[name][method] = row
             reference = row["unseen"] if method == REFERENCE else reference
             cells = " ".join(f"{row[c]:7.3f}" if row[c] is not None else f"{'-':>7}" for c in COLUMNS.split())

@@ -21,8 +21,8 @@ SPACING = 0.01
 class SeenSurface:
     """Distances to the closest surface point in any noise-free image, negative inside of solids.
 
-    Its error is of what no image shows: the surface at points whose closest one is hidden. A map has less only where it
-    guesses right.
+    Apart from the spacing of its points, it errs only where the closest surface is one that no image shows. A map errs
+    less only where it guesses right.
 
     Args:
         sequence: noise-free depth images; every `stride`-th is taken.

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from benchmarks.large_spaces import Row
 from benchmarks.large_spaces import table as spaces
 from benchmarks.publishing import publish
+from benchmarks.realtime import Realtime
+from benchmarks.realtime import main as run_live
 from benchmarks.realtime_report import SHOWN
 from benchmarks.realtime_report import table as realtime
 
@@ -27,3 +31,10 @@ def test_spaces_are_shown_by_halves() -> None:
     rows = [Row("room", 10.0 + n, 1.0 + n, 0.5 + n, 20.0 + 10 * (n > 1), 0.1) for n in range(4)]
     line = spaces([*rows, *(Row("house", 99.0, 9.0, 8.0, 40.0, 0.2) for _ in range(2))]).splitlines()[2]
     assert line == "| room | 13 | 4 | 3.5 | 20 | 30 | 0.10 |"
+
+
+@pytest.mark.parametrize("only", [(), ("apt_9_nav",)])
+def test_sequences_that_are_not_there_are_named(tmp_path, only) -> None:
+    with pytest.raises(SystemExit, match=r"no sequence (any|apt_9_nav) with a truth\.json, only none"):
+        run_live(Realtime(sequences=tmp_path, only=only, out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()

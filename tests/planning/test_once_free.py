@@ -242,15 +242,18 @@ def test_who_stands_at_the_goal_beside_the_robot_is_given_room() -> None:
     assert float((plans[-1].result.trajectory.waypoints[-1] - goal).norm()) > 1.3
 
 
+@pytest.mark.parametrize(("price", "off"), [(2.0, 1.2), (1.5, OUT_OF_WAY)])
 @pytest.mark.parametrize("shut_in", [True, False])
-def test_it_waits_where_it_shuts_in_nobody(shut_in: bool) -> None:
+def test_it_waits_where_it_shuts_in_nobody(shut_in: bool, price: float, off: float) -> None:
     walls = NOOK if shut_in else Union(*NOOK.parts[:2])
     person, goal, far = Cylinder((1.6, 0.0), 0.3), torch.tensor([2.8, 0.0]), torch.tensor([-2.0, 0.0])
-    planner, occupied = BasePlanner(BODY), Entered(walls, person)
+    config = BasePlannerConfig()
+    config = replace(config, search=replace(config.search, through_passing=price))
+    planner, occupied = BasePlanner(BODY, config), Entered(walls, person)
     planner.plan(far, goal, Entered(walls))
     plan, route = planner.plan(far, goal, occupied, now=1.0), planner.route(far, goal, occupied)
     end = plan.result.trajectory.waypoints[-1]
-    assert plan.usable and route.grid.room(route.onward, end, OUT_OF_WAY) > 20.0
+    assert plan.usable and route.grid.room(route.onward, end, off) > 20.0
     assert (float((end - plan.onward[0]).norm()) < 1.2) != shut_in
     assert not planner.leads_on(planner.route(end, goal, occupied), occupied, 2.0)
 
