@@ -173,16 +173,22 @@ def moved(
 
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[np.float32, np.float32]:
-    """Distance [m] and weight of the voxel at a lattice index; 0 and 0 where nothing is stored."""
+def row_of(bricks: Bricks, i: int, j: int, k: int) -> tuple[int, int]:
+    """Brick, -1 where none is stored, and place in it of the voxel at a lattice index."""
     table, corner = bricks.table, bricks.corner
     a, b, c = (i >> 3) - corner[0], (j >> 3) - corner[1], (k >> 3) - corner[2]
     if a < 0 or b < 0 or c < 0 or a >= table.shape[0] or b >= table.shape[1] or c >= table.shape[2]:
-        return np.float32(0), np.float32(0)
-    brick = table[a, b, c]
+        return np.int32(-1), 0
+    return table[a, b, c], (i & 7) * 64 + (j & 7) * 8 + (k & 7)
+
+
+@njit(cache=True, nogil=True, inline="always")
+@no_type_check
+def voxel_at(bricks: Bricks, i: int, j: int, k: int) -> tuple[np.float32, np.float32]:
+    """Distance [m] and weight of the voxel at a lattice index; 0 and 0 where nothing is stored."""
+    brick, at = row_of(bricks, i, j, k)
     if brick < 0:
         return np.float32(0), np.float32(0)
-    at = (i & 7) * 64 + (j & 7) * 8 + (k & 7)
     return bricks.distance[brick, at], bricks.weight[brick, at]
 
 

@@ -163,10 +163,12 @@ def _average(distances, weights, ended, pixels, z, depth, around, bands):
             continue
         far = max(measured, floor)
         # Behind a surface less and less is known; what is there may be seen from its other side.
-        weight = min(one, (ahead + band) / (band - voxel)) / (far * far * far * far)
+        known = min(one, (ahead + band) / (band - voxel))
+        weight = known * known / (far * far * far * far)
         old, before = distances[at], weights[at]
         value = min(ahead, band)
-        if abs(value - old) > np.float32(0.75) * band:
+        # And it contradicts only what says that there is free space, not the back of a board that was seen, too.
+        if (old if ahead < 0 else abs(value - old)) > np.float32(0.75) * band:
             through = around[pixel] - z[at] > np.float32(FAR_BEHIND) * band
             before = min(before, np.float32(TRUST_SEEN_THROUGH if through else TRUST) * weight)
         total = before + weight

@@ -75,8 +75,8 @@ def middle_values(window: Window, patches: Patches, bricks: Bricks, where):
                     continue
                 value, seen, free, taken_free, taken_other = _mean_of_corners(window, i, j, k)
                 at = (i * step, j * step, k * step)
-                upper, side, _ = nearest_patch(window, patches, at)
-                sign = side_of(window, bricks, at, upper, side, seen)
+                upper, height, weight = nearest_patch(window, patches, at)
+                sign = side_of(window, bricks, at, upper, height, weight, seen)
                 line[i, j, k] = value
                 miss[i, j, k] = _fine_value(upper, sign, seen, free, taken_free, taken_other) - value
     return line, miss
@@ -133,8 +133,8 @@ def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corr
                 k * window.ratio + m % FINE,
             )
             value, seen, free, taken_free, taken_other = between[:, m]
-            upper, side, _ = nearest_patch(window, patches, at)
-            sign = side_of(window, bricks, at, upper, side, seen)
+            upper, height, weight = nearest_patch(window, patches, at)
+            sign = side_of(window, bricks, at, upper, height, weight, seen)
             steps = (_fine_value(upper, sign, seen, free, taken_free, taken_other) - value) / np.float32(STEP)
             steps = max(np.float32(-127), min(np.float32(127), steps))
             corrections[number, m] = int(np.floor(steps + np.float32(0.5)))

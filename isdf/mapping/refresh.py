@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from .backs import unseen_backs
 from .bricks import BrickVolume
 from .completion import STRIDE, CompletionNet, features
 from .evidence import Evidence, bounds, gather
@@ -151,6 +152,7 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     seeds = kept_seeds(bricks, *bricks.box(low - MARGIN, high + MARGIN))
     if len(seeds) == 0:
         return False
+    seeds = np.concatenate([seeds, unseen_backs(seeds, bricks.arrays, lattice.arrays)])
     centre = seeds[:, :3]
     evidence = lattice.read("evidence", begin, end)
     proven = bounds(centre, evidence, lattice.corner + begin, lattice.spacing)

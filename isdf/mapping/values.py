@@ -84,8 +84,8 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
         for j in range(shape[1]):
             for k in range(shape[2]):
                 at = (i * window.ratio, j * window.ratio, k * window.ratio)
-                upper, side, seed = nearest_patch(window, patches, at)
-                sign = side_of(window, bricks, at, upper, side, window.evidence[i, j, k])
+                upper, height, weight = nearest_patch(window, patches, at)
+                sign = side_of(window, bricks, at, upper, height, weight, window.evidence[i, j, k])
                 low = min(window.lower[i, j, k], upper)
                 if sign < 0:
                     low = upper
@@ -103,12 +103,12 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
                 window.taken[i, j, k] = 2 * upper if sign < 0 else gap * share
                 window.value[i, j, k] = upper - window.taken[i, j, k]
                 window.state[i, j, k] = sign
-                faint = FAINT_WEIGHT / (patches.discs[seed, 6] + FAINT_WEIGHT)
+                faint = FAINT_WEIGHT / (weight + FAINT_WEIGHT)
                 odds = SEED_ODDS + FAINT_ODDS * faint
                 # The guess's error is Laplace distributed: its chance to be small, times that of the seed.
                 chance = (1 - np.exp(-LARGE_ERROR / max(error, np.float32(1e-3)))) / (1 + odds)
                 # Nobody has looked there: never more likely right than wrong.
-                chance = chance if sign != 0 else 0.5 * chance
+                chance = chance if sign != 0 and weight > 0 else 0.5 * chance
                 window.confidence[i, j, k] = int(255 * chance + 0.5)
 
 
@@ -126,7 +126,7 @@ def fused_at(window, bricks, at):
 
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def side_of(window, bricks, at, upper, height, seen):
+def side_of(window, bricks, at, upper, height, weight, seen):
     """Side of the surfaces a fine node lies on: 1, -1, or 0 where it is not known.
 
     Args:
@@ -135,10 +135,14 @@ def side_of(window, bricks, at, upper, height, seen):
         at: the node.
         upper: distance to the nearest patch [m].
         height: above that patch [m].
+        weight: of that patch, 0 if it is a guess.
         seen: evidence that the node is free.
     """
-    distance, weight = fused_at(window, bricks, at)
-    if weight > 0:
+    # Views that ended on a board are fused behind its back, too, as if it went on.
+    if weight <= 0 and height > 0 and upper < SOLID:
+        return 1
+    distance, views = fused_at(window, bricks, at)
+    if views > 0:
         # Within half a voxel of the surface the patch knows better.
         return 1 if (distance if abs(distance) > 0.5 * bricks.voxel else height) >= 0 else -1
     # What is looked through so near to a surface is fused; the coarser evidence of free space may come from before it.
@@ -150,12 +154,12 @@ def side_of(window, bricks, at, upper, height, seen):
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def nearest_patch(window, patches, at):
-    """Distance [m] of a fine node to the closest of the patches that are nearest around it, height above it, number."""
+    """Distance [m] of a fine node to the closest of the patches nearest around it, height above it, and its weight."""
     x = window.step * (window.first[0] * window.ratio + at[0])
     y = window.step * (window.first[1] * window.ratio + at[1])
     z = window.step * (window.first[2] * window.ratio + at[2])
     discs = patches.discs
-    best, side, number = np.float32(1e30), np.float32(1), 0
+    best, side, weight = np.float32(1e30), np.float32(1), np.float32(0)
     for i in range(at[0] // 2, (at[0] + 1) // 2 + 1):
         for j in range(at[1] // 2, (at[1] + 1) // 2 + 1):
             for k in range(at[2] // 2, (at[2] + 1) // 2 + 1):
@@ -171,5 +175,5 @@ def nearest_patch(window, patches, at):
                 across = max(np.float32(0), np.sqrt(max(np.float32(0), away - height * height)) - radius)
                 square = across * across + height * height
                 if square < best:
-                    best, side, number = square, height, n
-    return np.sqrt(best), side, number
+                    best, side, weight = square, height, discs[n, 6]
+    return np.sqrt(best), side, weight

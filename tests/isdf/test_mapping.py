@@ -109,7 +109,7 @@ def test_guesses_are_made_about_the_camera_but_where_something_was_seen(eye, spa
 
 
 def test_a_room_is_guessed_as_a_whole_from_its_corner(monkeypatch):
-    middles = []
+    middles, mapper = [], Mapper(MapperConfig(guess_period=0.0))
 
     def guess(lattice, bricks, network, middle, up):
         middles.append(middle)
@@ -117,7 +117,7 @@ def test_a_room_is_guessed_as_a_whole_from_its_corner(monkeypatch):
 
     monkeypatch.setattr("isdf.mapping.mapper.guess", guess)
     monkeypatch.setattr(refresh, "GUESS_ACROSS", 1.6)
-    mapper, away = Mapper(MapperConfig(guess_period=0.0)), []
+    away = []
     for frame in furnished_orbit(16)[:8]:
         mapper.integrate(frame)
         low, high = mapper.bounds.numpy()[:, :2]

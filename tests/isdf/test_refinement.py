@@ -201,6 +201,8 @@ def test_the_nearest_patch_is_the_nearest_of_all_about_a_node(refreshed):
         height = (away * patches.discs[around, 3:6]).sum(axis=1)
         across = np.sqrt(np.maximum(0, (away**2).sum(axis=1) - height**2)) - patches.discs[around, 7]
         exact = np.hypot(np.maximum(0, across), height)
-        distance, side, number = nearest_patch(window, patches, tuple(at.tolist()))
+        distance, side, weight = nearest_patch(window, patches, tuple(at.tolist()))
         assert distance == pytest.approx(exact.min(), abs=1e-5)
-        assert side == pytest.approx(height[around == number][0], abs=1e-5)
+        closest = exact.argmin()
+        assert side == pytest.approx(height[closest], abs=1e-5)
+        assert weight == patches.discs[around[closest], 6]
