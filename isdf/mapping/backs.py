@@ -14,7 +14,7 @@ from numba import njit
 
 from .bricks import Bricks, row_of
 from .evidence import FREE_ABOVE
-from .lattice import CHUNK, LatticeArrays, node_at
+from .lattice import CHUNK, FINE, LatticeArrays, node_at
 from .planes import planes
 from .seeds import ENDED
 
@@ -28,6 +28,8 @@ ENOUGH, SHARE = 6, 0.1
 # The back is this much nearer [voxels] than where free space begins behind the first so large share of them: voxels are
 # known to be free from their middles, and those closest behind the board are averaged with views that ended on it.
 BEFORE, FIRST = 0.75, 0.1
+# Each board holds a node of the field at least so far inside [voxels], or it would fall between two of them.
+HELD = 0.3
 # Up to this depth [voxels] views end on the front itself.
 FRONT = 1.6
 # Depths are counted by this share of a voxel.
@@ -51,7 +53,7 @@ def unseen_backs(
         return seeds
     plane, normal = planes(seeds, bricks.voxel)
     thickness = _thicknesses(seeds, plane, normal, _free_behind(seeds, bricks, lattice), bricks.voxel)
-    return _discs(seeds, thickness[plane], bricks)
+    return _discs(seeds, thickness[plane], bricks, lattice.spacing / (FINE - 1))
 
 
 @njit(cache=True, nogil=True)
@@ -157,17 +159,34 @@ def _thicknesses(seeds, plane, normal, depth, voxel):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _discs(seeds, thickness, bricks):
-    """Discs (m, 8) so far behind the seeds (n, 8) as they are thick (n,), if they are and no view ended there."""
+def _discs(seeds, thickness, bricks, step):
+    """Discs (m, 8) so far behind the seeds (n, 8) as they are thick (n,), if they are and no view ended there.
+
+    Behind the first node of the field inside them they lie in any case; nodes are a step apart [m].
+    """
     out, count = np.empty((len(seeds), 8), dtype=np.float32), 0
     for s in range(len(seeds)):
         if thickness[s] > 0 and not _ended_behind(bricks, seeds[s], thickness[s]):
+            thick = max(thickness[s], _to_node(seeds[s], step) + np.float32(HELD * bricks.voxel))
             for a in range(3):
-                out[count, a] = seeds[s, a] - thickness[s] * seeds[s, 3 + a]
+                out[count, a] = seeds[s, a] - thick * seeds[s, 3 + a]
                 out[count, 3 + a] = -seeds[s, 3 + a]
             out[count, 6], out[count, 7] = 0, seeds[s, 7]
             count += 1
     return out[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _to_node(seed, step):
+    """How far behind a seed [m], along its normal, the first plane of nodes across it lies that is inside."""
+    a = 3
+    for b in range(4, 6):
+        a = b if abs(seed[b]) > abs(seed[a]) else a
+    way = 1 if seed[a] > 0 else -1
+    inside = np.float32(HELD / 2) * step
+    place = way * seed[a - 3] - inside
+    return (inside + place - step * np.floor(place / step)) * abs(seed[a])
 
 
 @njit(cache=True, nogil=True)

@@ -138,9 +138,9 @@ def side_of(window, bricks, at, upper, height, weight, seen):
         weight: of that patch, 0 if it is a guess.
         seen: evidence that the node is free.
     """
-    # Views that ended on a board are fused behind its back, too, as if it went on.
-    if weight <= 0 and height > 0 and upper < SOLID:
-        return 1
+    # Views that ended on a board are fused behind its back, too, as if it went on. And just inside it is solid.
+    if weight <= 0 and upper < SOLID and height > -0.5 * bricks.voxel:
+        return 1 if height > 0 else -1
     distance, views = fused_at(window, bricks, at)
     if views > 0:
         # Within half a voxel of the surface the patch knows better.
