@@ -167,7 +167,8 @@ def _discs(seeds, thickness, bricks, step):
     out, count = np.empty((len(seeds), 8), dtype=np.float32), 0
     for s in range(len(seeds)):
         if thickness[s] > 0 and not _ended_behind(bricks, seeds[s], thickness[s]):
-            thick = max(thickness[s], _to_node(seeds[s], step) + np.float32(HELD * bricks.voxel))
+            held = np.float32(HELD * bricks.voxel)
+            thick = max(thickness[s], _to_node(seeds[s], step, held) + held)
             for a in range(3):
                 out[count, a] = seeds[s, a] - thick * seeds[s, 3 + a]
                 out[count, 3 + a] = -seeds[s, 3 + a]
@@ -178,15 +179,17 @@ def _discs(seeds, thickness, bricks, step):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _to_node(seed, step):
-    """How far behind a seed [m], along its normal, the first plane of nodes across it lies that is inside."""
+def _to_node(seed, step, held):
+    """How far behind a seed, along its normal, the first plane of nodes lies that is held so far inside [m].
+
+    The planes are those, a step apart, that are across the axis closest to the normal.
+    """
     a = 3
     for b in range(4, 6):
         a = b if abs(seed[b]) > abs(seed[a]) else a
     way = 1 if seed[a] > 0 else -1
-    inside = np.float32(HELD / 2) * step
-    place = way * seed[a - 3] - inside
-    return (inside + place - step * np.floor(place / step)) * abs(seed[a])
+    place = way * seed[a - 3] - held
+    return (held + place - step * np.floor(place / step)) * abs(seed[a])
 
 
 @njit(cache=True, nogil=True)
