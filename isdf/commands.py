@@ -59,11 +59,14 @@ class Query:
         """Load, query, write."""
         field = load_map(map_file(self.map)).field()
         try:
-            points = np.load(self.points, allow_pickle=False)
+            with self.points.open("rb") as file:
+                points = np.lib.format.read_array(file, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise IsdfError(f"{self.points}: not a readable .npy array ({error})") from error
-        if not isinstance(points, np.ndarray) or points.ndim != 2:
-            raise IsdfError(f"{self.points}: points must be one (N, 3) array")
+            raise IsdfError(
+                f"{self.points}: not a readable .npy array ({error}); numpy.save writes one of (N, 3) points"
+            ) from error
+        if points.ndim != 2:
+            raise IsdfError(f"{self.points}: points must be one (N, 3) array, got the shape {points.shape}")
         blocks = np.array_split(points, max(1, len(points) // QUERY_POINTS))
         parts = [query(field, block) for block in tqdm(blocks, desc="querying", disable=None)]
         answers = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -53,6 +53,40 @@ def test_info_prints_the_header(map_path, monkeypatch, capsys) -> None:
     assert json.loads(text)["bounds"] == mapfile.header(map_path)["bounds"] and "\n" not in text
 
 
+def _text(path):
+    path.write_text("x,y,z\n0,0,1\n")
+
+
+def _pickled(path):
+    np.save(path, np.array([{}]), allow_pickle=True)
+
+
+def _several(path):
+    with path.open("wb") as file:
+        np.savez(file, points=np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize(
+    ("write_points", "fault"),
+    [
+        pytest.param(_text, "magic string is not correct", id="text"),
+        pytest.param(_several, "magic string is not correct", id="npz"),
+        pytest.param(_pickled, "Object arrays cannot be loaded", id="pickled"),
+        pytest.param(lambda path: None, "No such file", id="missing"),
+        pytest.param(lambda path: path.mkdir(), "Is a directory", id="folder"),
+        pytest.param(lambda path: np.save(path, np.zeros(3)), "got the shape (3,)", id="one-point"),
+    ],
+)
+def test_points_that_cannot_be_read_are_said_so_in_one_line(
+    write_points, fault, map_path, tmp_path, monkeypatch, capsys
+) -> None:
+    points, out = tmp_path / "points.npy", tmp_path / "a.npz"
+    write_points(points)
+    code, _, error = run(monkeypatch, capsys, "query", map_path, "--points", points, "--out", out)
+    assert code == 2 and fault in error and str(points) in error and "\n" not in error
+    assert "(N, 3)" in error and not out.exists()
+
+
 def test_export_writes_and_reports(map_path, tmp_path, monkeypatch, capsys) -> None:
     out = tmp_path / "deep" / "grid.npz"
     words = ("export", map_path, "--format", "npz", "--out", out, "--spacing", 0.2, "--json")
