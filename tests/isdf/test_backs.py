@@ -101,13 +101,12 @@ def test_a_back_that_was_seen_is_not_guessed():
     assert middle.sum() == 0
 
 
-@pytest.mark.parametrize("thickness", [0.03, 0.04])
-def test_a_view_of_one_side_of_a_board_leaves_the_other_where_it_was_seen(thickness):
-    sdf = room(box((0.0, 0.0, 0.6), (1.0, thickness, 0.5)))
+def test_a_view_of_one_side_of_a_board_leaves_the_other_where_it_was_seen():
+    sdf = room(box((0.0, 0.0, 0.6), (1.0, 0.04, 0.5)))
     points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     points = points * torch.tensor([0.8, 0.24, 0.4]) + torch.tensor([0.0, 0.0, 0.6])
     field = seen_from_above(sdf, (0.0, 0.0, 0.6)).field()
-    assert (field.distance(points) - sdf(points)).abs().mean() < 0.006
+    assert (field.distance(points) - sdf(points)).abs().mean() < 0.0025
 
 
 def test_a_thin_shelf_does_not_fall_between_the_nodes():
