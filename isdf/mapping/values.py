@@ -31,7 +31,7 @@ class Patches(NamedTuple):
     """Discs that stand for the surface, and which is nearest where.
 
     Args:
-        discs: (n, 8) float32, see `isdf.mapping.seeds.surface_seeds`.
+        discs: (n, 8) float32, see `isdf.mapping.seeds.surface_seeds`; those of `isdf.mapping.backs` have no weight.
         nearest: (nx, ny, nz) int32 index of the nearest of every second fine node of the window.
     """
 
