@@ -10,6 +10,8 @@ from ..numbers import require_finite
 
 # Four times the default limit; a brick takes six kilobytes, though most places never get one.
 MOST_BRICKS = 1 << 27
+# A depth camera that errs by a tenth needs another calibration than this one.
+MOST_DISTORTION = 0.1
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class MapperConfig:
         fuse_period: least frame time between two images that are fused [s]: those between show hardly more.
         refresh_period: least frame time between two refreshes of the distances [s].
         guess_period: least frame time between two runs of the network [s].
+        distortion: how large the camera's own low-frequency depth error is expected to be, as a share of the depth
+            (standard deviation); the map learns it from the images and frees them of it. 0: depth is taken as it is.
         visitors: what came into free space, was not seen to stay and has been out of view for this long [s], or for as
             long as it had stood there, is taken back out of the map, for somebody who walks by does not stand where the
             camera saw him last; None: never.
@@ -40,6 +44,7 @@ class MapperConfig:
     fuse_period: float = 0.05
     refresh_period: float = 0.25
     guess_period: float = 1.0
+    distortion: float = 0.01
     visitors: float | None = None
     max_bricks: int = 32_000_000
 
@@ -66,6 +71,10 @@ class MapperConfig:
             raise ConfigError(
                 f"truncation must be more than two voxels, got {self.truncation} m with a voxel of {self.voxel} m"
             )
-        for name in ("fuse_period", "refresh_period", "guess_period", "truncation_noise"):
+        for name in ("fuse_period", "refresh_period", "guess_period", "truncation_noise", "distortion"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must be zero or more, got {getattr(self, name)}")
+        if self.distortion > MOST_DISTORTION:
+            raise ConfigError(
+                f"distortion must be at most {MOST_DISTORTION}, a share of the depth, got {self.distortion}"
+            )

@@ -25,6 +25,7 @@ from .agreement import compare
 from .bricks import BrickVolume, missing_bricks, view_box
 from .completion import load_network
 from .config import MapperConfig
+from .distortion import Distortion
 from .evidence import look_through
 from .field import LatticeField
 from .footprint import clear
@@ -73,6 +74,7 @@ class Mapper(ShownMapper):
         self.bricks = BrickVolume(self.config.voxel, self.config.max_bricks)
         self.lattice = Lattice(RATIO * self.config.voxel)
         self.visitors = Visitors(self.bricks, self.lattice, self.config.truncation, self.config.visitors)
+        self.distortion = Distortion(self.config.distortion)
         self.network = load_network().to(self.device)
         self.frames_seen = self.frames_skipped = self.steps = 0
         self.up = np.zeros(3)
@@ -105,13 +107,14 @@ class Mapper(ShownMapper):
             FrameError: the frame cannot be used; the map is as it was before the call.
         """
         frame = DepthFrame.of(frame).to(torch.device("cpu"))
-        depth, T = self._usable(frame), frame.T_world_camera.numpy()
-        if self._repeats(depth, frame.time):
+        measured, T = self._usable(frame), frame.T_world_camera.numpy()
+        if self._repeats(measured, frame.time):
             return
         if 0 < frame.time - self._fused_at < self.config.fuse_period:
             self.frames_seen += 1
             self._keep_up(T[:3, 3], frame.time)
             return
+        depth = self.distortion.correct(measured, _intrinsics(frame))
         stride = max(1, depth.shape[1] // COLUMNS)
         appeared = self._appeared(depth, T, stride, frame)
         if appeared is None:
@@ -131,6 +134,7 @@ class Mapper(ShownMapper):
         self._fuse(depth, T, frame, box, appeared, stride)
         self._fused_at = frame.time
         self._motion.believe(Moment(depth, _intrinsics(frame), T, frame.time))
+        self.distortion.learn(measured, _intrinsics(frame), T)
         self.frames_seen += 1
         feet = self.visitors.stand(depth, _intrinsics(frame), np.linalg.inv(T), up)
         for part in (box, feet):

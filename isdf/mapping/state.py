@@ -15,11 +15,12 @@ from torch import Tensor
 from ..errors import CheckpointError
 from ..mapfile import consistent, read, write
 from .config import MapperConfig
+from .distortion import Key
 from .lattice import BLOCK, CHUNK, NODES
 from .mapper import Mapper
 
 FORMAT = "isdf-lattice-map"
-VERSION = 4
+VERSION = 5
 
 
 def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
@@ -43,6 +44,8 @@ def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
     arrays["bricks.distance"] = bricks.distance.astype(np.float16)
     arrays["bricks.weight"] = bricks.weight.astype(np.float16)
     arrays["bricks.ended"] = bricks.ended.astype(np.float16)
+    arrays["distortion.information"] = mapper.distortion.information
+    arrays["distortion.vector"] = mapper.distortion.vector
     tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
     header = {
         "format": FORMAT,
@@ -51,6 +54,7 @@ def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:
         "bricks_corner": bricks.corner.tolist(),
         "lattice_corner": lattice.corner.tolist(),
         "up": mapper.up.tolist(),
+        "camera": mapper.distortion.key,
         "frames_seen": mapper.frames_seen,
         "frames_skipped": mapper.frames_skipped,
         "steps": mapper.steps,
@@ -92,6 +96,12 @@ def _restored(tensors: dict[str, Tensor], header: dict[str, Any], device: str | 
     _check_numbers("cells", nodes["block"], 2, len(corrections))
     lattice.nodes.restore(nodes)
     lattice.cells.restore({"corrections": corrections})
+    key = header["camera"]
+    mapper.distortion.restore(
+        Key(tuple(key[0]), tuple(key[1])) if key else None,
+        arrays["distortion.information"],
+        arrays["distortion.vector"],
+    )
     mapper._bounds = tensors["bounds"].reshape(2, 3)
     mapper.up = np.array(header["up"], dtype=float).reshape(3)
     mapper.frames_seen, mapper.frames_skipped = int(header["frames_seen"]), int(header["frames_skipped"])
