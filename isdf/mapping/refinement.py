@@ -10,11 +10,12 @@ from numba import njit
 from .bricks import Bricks
 from .evidence import FREE_ABOVE
 from .lattice import BLOCK, FINE, STEP
-from .values import SOLID, Patches, Window, fused_at, nearest_patch, side_of
+from .patches import MOST, NODES, Patches, cell_place, height_above, nearest_of, patch_at, patches_about
+from .values import SOLID, Window, fused_at, side_of
 
 # A cell is refined when interpolation misses one of its middles by more than this [m], plus shares of the distance
 # and of what is guessed there.
-TOLERANCE, SLACK, GUESS_SLACK = 0.004, 0.01, 0.15
+TOLERANCE, SLACK, GUESS_SLACK = 0.003, 0.005, 0.15
 # Weights (8, 125) of a cell's corners in trilinear interpolation at its fine nodes.
 _part = np.stack([np.linspace(1, 0, FINE), np.linspace(0, 1, FINE)])
 WEIGHTS = np.einsum("pa,qb,rc->pqrabc", _part, _part, _part).reshape(8, BLOCK).astype(np.float32)
@@ -74,8 +75,8 @@ def middle_values(window: Window, patches: Patches, bricks: Bricks, where):
                     line[i, j, k] = window.value[i // 2, j // 2, k // 2]
                     continue
                 value, seen, free, taken_free, taken_other = _mean_of_corners(window, i, j, k)
+                upper, height, weight = patch_at(window, patches, (i, j, k))
                 at = (i * step, j * step, k * step)
-                upper, height, weight = nearest_patch(window, patches, at)
                 sign = side_of(window, bricks, at, upper, height, weight, seen)
                 line[i, j, k] = value
                 miss[i, j, k] = _fine_value(upper, sign, seen, free, taken_free, taken_other) - value
@@ -119,24 +120,31 @@ def cells_to_refine(window: Window, line, miss, corrections, refine, stale):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def refined_values(window: Window, patches: Patches, bricks: Bricks, cells, corrections):
-    """Write the corrections of cells (n, 3): what interpolation of the corners misses at each of their fine nodes."""
-    between = np.empty((5, BLOCK), dtype=np.float32)
+def refined_values(window: Window, patches: Patches, bricks: Bricks, miss, cells, corrections):
+    """Write the corrections of cells (n, 3): what interpolation of the corners misses at each of their fine nodes.
+
+    At every second of them that is known: `miss` of `middle_values` [m].
+    """
+    between, offsets = np.empty((5, BLOCK), dtype=np.float32), np.float32(window.step) * NODES
+    chosen, which = np.empty(MOST, dtype=np.int32), np.zeros(BLOCK, dtype=np.int32)
+    distance, discs = np.empty(BLOCK, dtype=np.float32), patches.discs
     for n in range(len(cells)):
         i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
         _between_corners(window, i, j, k, between)
+        count, place = patches_about(window, patches, i, j, k, chosen), cell_place(window, i, j, k)
+        nearest_of(discs, chosen[:count], place, offsets, distance, which)
         number = window.block[i, j, k]
         for m in range(BLOCK):
-            at = (
-                i * window.ratio + m // FINE**2,
-                j * window.ratio + (m // FINE) % FINE,
-                k * window.ratio + m % FINE,
-            )
-            value, seen, free, taken_free, taken_other = between[:, m]
-            upper, height, weight = nearest_patch(window, patches, at)
-            sign = side_of(window, bricks, at, upper, height, weight, seen)
-            steps = (_fine_value(upper, sign, seen, free, taken_free, taken_other) - value) / np.float32(STEP)
-            steps = max(np.float32(-127), min(np.float32(127), steps))
+            a, b, c = m // FINE**2, (m // FINE) % FINE, m % FINE
+            if (a | b | c) & 1 == 0:
+                off = miss[2 * i + a // 2, 2 * j + b // 2, 2 * k + c // 2]
+            else:
+                at = (i * window.ratio + a, j * window.ratio + b, k * window.ratio + c)
+                value, seen, free, taken_free, taken_other = between[:, m]
+                height, weight = height_above(discs, which[m], place, offsets, m), discs[which[m], 6]
+                sign = side_of(window, bricks, at, distance[m], height, weight, seen)
+                off = _fine_value(distance[m], sign, seen, free, taken_free, taken_other) - value
+            steps = max(np.float32(-127), min(np.float32(127), off / np.float32(STEP)))
             corrections[number, m] = int(np.floor(steps + np.float32(0.5)))
 
 

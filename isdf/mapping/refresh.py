@@ -15,10 +15,11 @@ from .completion import STRIDE, CompletionNet, features
 from .evidence import Evidence, bounds, gather
 from .lattice import FINE, Lattice
 from .nearest import finer_nearest
+from .patches import Patches, in_cubes
 from .refinement import cells_to_refine, middle_values, near_known, refined_values
 from .seeds import kept_seeds
 from .standing import vertical
-from .values import Patches, Window, coarse_values
+from .values import Window, coarse_values
 
 # Surfaces this far outside a window still count in it [m].
 MARGIN = 2.5
@@ -172,11 +173,11 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
         taken=np.empty(proven.lower.shape, dtype=np.float32),
         block=lattice.read("block", begin, end),
     )
-    # Nearest seeds are found for every second fine node; the others choose among those around them.
+    # Nearest seeds are found for every second fine node; the others choose among those of a cell.
     where = near_known(window, bricks.arrays)
     places = (centre / np.float32(lattice.spacing / 2) - 2 * window.first).astype(np.float32)
     nearest = finer_nearest(places, proven.nearest, where)
-    patches = Patches(seeds, nearest)
+    patches = Patches(seeds, nearest, *in_cubes(places, where.shape))
     coarse_values(window, patches, bricks.arrays)
     line, miss = middle_values(window, patches, bricks.arrays, where)
     refine, stale = np.zeros_like(window.block, dtype=np.bool_), np.zeros_like(window.block, dtype=np.bool_)
@@ -186,6 +187,6 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     inner[:-1, :-1, :-1] = True
     written = inner & refine & ((window.block < 0) | stale)
     lattice.reassign(window.block, written, inner & ~refine)
-    refined_values(window, patches, bricks.arrays, np.argwhere(written), lattice.corrections)
+    refined_values(window, patches, bricks.arrays, miss, np.argwhere(written), lattice.corrections)
     lattice.write(begin, end, value=window.value, confidence=window.confidence, block=window.block)
     return True

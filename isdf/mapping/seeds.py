@@ -13,8 +13,9 @@ from .bricks import SIDE, VOXELS, Bricks, BrickVolume
 # Where space hidden behind the edge of a thing borders on space that another view looks through the distances cross
 # zero, too, but no view ends there. With less evidence of a surface than that it is none.
 ENDED = 0.3
-# Radius of the disc that stands for the surface in a voxel [voxels]: closes the gaps between those of neighbours.
-PATCH = 0.5
+# Radius of the disc that stands for the surface in a voxel [voxels]: closes most of the gap between neighbours, and
+# juts out little over edges.
+PATCH = 0.45
 # Crossings in a block of so many voxels a side are one patch if their mean normal is this long and none is farther off
 # the plane than this [voxels]: flat surfaces are averaged, edges and thin boards stay sharp.
 BLOCK = 2

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int
 from numba import njit
 
 from .bricks import Bricks, voxel_at
 from .evidence import FREE_ABOVE, SURFACE_REACH
+from .patches import Patches, patch_at
 
 # Errors above this [m] are what the confidence is about.
 LARGE_ERROR = 0.05
@@ -25,18 +25,6 @@ UNFORESEEN, MOST_UNFORESEEN = np.float32(0.09), np.float32(0.017)
 # Straight behind a surface it is solid for this long [m], though no view ended there; straight is what is within this
 # cosine of its normal.
 SOLID, STRAIGHT = np.float32(0.1), np.float32(0.7)
-
-
-class Patches(NamedTuple):
-    """Discs that stand for the surface, and which is nearest where.
-
-    Args:
-        discs: (n, 8) float32, see `isdf.mapping.seeds.surface_seeds`; those of `isdf.mapping.backs` have no weight.
-        nearest: (nx, ny, nz) int32 index of the nearest of every second fine node of the window.
-    """
-
-    discs: Float[np.ndarray, "n 8"]
-    nearest: Int[np.ndarray, "nx ny nz"]
 
 
 class Window(NamedTuple):
@@ -84,7 +72,7 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
         for j in range(shape[1]):
             for k in range(shape[2]):
                 at = (i * window.ratio, j * window.ratio, k * window.ratio)
-                upper, height, weight = nearest_patch(window, patches, at)
+                upper, height, weight = patch_at(window, patches, (2 * i, 2 * j, 2 * k))
                 sign = side_of(window, bricks, at, upper, height, weight, window.evidence[i, j, k])
                 low = min(window.lower[i, j, k], upper)
                 if sign < 0:
@@ -149,31 +137,3 @@ def side_of(window, bricks, at, upper, height, weight, seen):
     if upper < SOLID and height < -STRAIGHT * upper:
         return -1
     return 1 if seen > FREE_ABOVE else 0
-
-
-@njit(cache=True, nogil=True, inline="always")
-@no_type_check
-def nearest_patch(window, patches, at):
-    """Distance [m] of a fine node to the closest of the patches nearest around it, height above it, and its weight."""
-    x = window.step * (window.first[0] * window.ratio + at[0])
-    y = window.step * (window.first[1] * window.ratio + at[1])
-    z = window.step * (window.first[2] * window.ratio + at[2])
-    discs = patches.discs
-    best, side, weight = np.float32(1e30), np.float32(1), np.float32(0)
-    for i in range(at[0] // 2, (at[0] + 1) // 2 + 1):
-        for j in range(at[1] // 2, (at[1] + 1) // 2 + 1):
-            for k in range(at[2] // 2, (at[2] + 1) // 2 + 1):
-                # To work out a patch twice, or one too far away, takes less time than to tell.
-                n = patches.nearest[i, j, k]
-                a, b, c = (
-                    np.float32(x - discs[n, 0]),
-                    np.float32(y - discs[n, 1]),
-                    np.float32(z - discs[n, 2]),
-                )
-                away = a * a + b * b + c * c
-                height, radius = a * discs[n, 3] + b * discs[n, 4] + c * discs[n, 5], discs[n, 7]
-                across = max(np.float32(0), np.sqrt(max(np.float32(0), away - height * height)) - radius)
-                square = across * across + height * height
-                if square < best:
-                    best, side, weight = square, height, discs[n, 6]
-    return np.sqrt(best), side, weight

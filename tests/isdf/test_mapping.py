@@ -465,7 +465,7 @@ def test_images_that_follow_closely_are_passed_over_unless_the_clock_stands_stil
 def test_flat_surfaces_are_averaged_and_edges_stay_sharp():
     bricks = fused_wall()
     discs = surface_seeds(bricks.arrays, *bricks.box(np.zeros(3), np.full(3, 0.1)))
-    np.testing.assert_allclose(discs[:, 7], 0.02)  # four voxels in one
+    np.testing.assert_allclose(discs[:, 7], 2 * 0.45 * 0.02)  # four voxels in one
     np.testing.assert_allclose(discs[:, 3:6], [[0, 0, -1]] * len(discs), atol=1e-3)
     x = 0.02 * np.arange(8)
     roof = np.maximum(0.07 - x[None, None, :], 0.07 - x[None, :, None]) + 0 * x[:, None, None]

@@ -11,8 +11,8 @@ from isdf.mapping import refresh
 from isdf.mapping.evidence import FREE, bounds
 from isdf.mapping.lattice import BLOCK, FINE, STEP
 from isdf.mapping.nearest import finer_nearest, nearest_points
+from isdf.mapping.patches import MOST, NODES, cell_place, nearest_of, patch_at, patches_about
 from isdf.mapping.refinement import cells_to_refine, middle_values, near_known, refined_values
-from isdf.mapping.values import nearest_patch
 from tests.isdf.rooms import furnished_orbit
 
 
@@ -28,8 +28,7 @@ def refreshed():
         for frame in furnished_orbit(16)[:6]:
             mapper.integrate(frame)
         mapper.refresh()
-    window, patches, bricks, _, _ = kept[-1]
-    return window, patches, bricks
+    return kept[-1][:3]
 
 
 def nodes_of(shape):
@@ -164,7 +163,7 @@ def test_what_is_stored_of_a_cell_is_what_its_middles_miss(refreshed):
     window.block[refine] = np.arange(len(cells))
     corrections = np.zeros((len(cells), BLOCK), dtype=np.int8)
     assert refinement(window, line, miss, corrections)[1][refine].all()
-    refined_values(window, patches, bricks, cells, corrections)
+    refined_values(window, patches, bricks, miss, cells, corrections)
     again, stale = refinement(window, line, miss, corrections)
     assert np.array_equal(again, refine) and stale.sum() < 0.01 * len(
         cells
@@ -187,22 +186,68 @@ def test_a_mask_changes_nothing_of_what_is_refined(refreshed):
     np.testing.assert_array_equal(refinement(window, line, miss, none)[0], refinement(window, *full, none)[0])
 
 
-def test_the_nearest_patch_is_the_nearest_of_all_about_a_node(refreshed):
+def to_discs(discs, places):
+    """Distances (n, m) of places (n, 3) to discs (m, 8), and heights above their planes."""
+    away = places[:, None] - discs[None, :, :3]
+    height = (away * discs[:, 3:6]).sum(axis=2)
+    across = np.sqrt(np.maximum(0, (away**2).sum(axis=2) - height**2)) - discs[:, 7]
+    return np.hypot(np.maximum(0, across), height), height
+
+
+def test_the_patch_at_a_node_is_told_from_there(refreshed):
     window, patches, bricks = refreshed
-    places = np.argwhere(near_known(window, bricks)[:-1, :-1, :-1])
     rng = np.random.default_rng(0)
-    for place in rng.choice(places, 400):
-        at = 2 * place + rng.integers(0, 2, 3)
-        around = patches.nearest[tuple(slice(a // 2, (a + 1) // 2 + 1) for a in at)].ravel()
-        around = around[around >= 0]
-        if len(around) < np.prod(1 + at % 2):
+    for at in rng.choice(np.argwhere(near_known(window, bricks)), 300):
+        place = window.step * (window.first * window.ratio + at * window.ratio / 2)
+        number = patches.nearest[tuple(at)]
+        exact, height = to_discs(patches.discs[[number]], place[None])
+        distance, side, weight = patch_at(window, patches, tuple(at.tolist()))
+        assert distance == pytest.approx(exact[0, 0], abs=1e-4)
+        assert side == pytest.approx(height[0, 0], abs=1e-4) and weight == patches.discs[number, 6]
+
+
+def refined_cells(refreshed, count):
+    """Cells to refine, and of each the distances to discs and their numbers at its fine nodes, and the nodes [m]."""
+    window, patches, bricks = refreshed
+    line, miss = middle_values(window, patches, bricks, near_known(window, bricks))
+    refine, _ = refinement(
+        window._replace(block=np.full_like(window.block, -1)), line, miss, np.zeros((0, BLOCK), dtype=np.int8)
+    )
+    chosen, which = np.empty(MOST, dtype=np.int32), np.zeros(BLOCK, dtype=np.int32)
+    distance, offsets = np.empty(BLOCK, dtype=np.float32), np.float32(window.step) * NODES
+    for cell in np.random.default_rng(0).permutation(np.argwhere(refine))[:count].tolist():
+        found = patches_about(window, patches, *cell, chosen)
+        place = cell_place(window, *cell)
+        nearest_of(patches.discs, chosen[:found], place, offsets, distance, which)
+        yield cell, distance.copy(), which.copy(), np.array(place) + offsets.T
+
+
+def test_a_cell_knows_the_nearest_of_all_patches_close_to_a_surface(refreshed):
+    """With only those nearest to every second node, a third of the distances were wrong by more than a centimetre."""
+    discs, errors = refreshed[1].discs, []
+    for _, distance, which, places in refined_cells(refreshed, 250):
+        near = np.linalg.norm(discs[:, :3] - places.mean(axis=0), axis=1) < 0.3
+        if not near.any():
             continue
-        away = window.step * (window.first * window.ratio + at) - patches.discs[around, :3]
-        height = (away * patches.discs[around, 3:6]).sum(axis=1)
-        across = np.sqrt(np.maximum(0, (away**2).sum(axis=1) - height**2)) - patches.discs[around, 7]
-        exact = np.hypot(np.maximum(0, across), height)
-        distance, side, weight = nearest_patch(window, patches, tuple(at.tolist()))
-        assert distance == pytest.approx(exact.min(), abs=1e-5)
-        closest = exact.argmin()
-        assert side == pytest.approx(height[closest], abs=1e-5)
-        assert weight == patches.discs[around[closest], 6]
+        exact, _ = to_discs(discs[near], places)
+        close = exact.min(axis=1) < 0.04
+        errors.append(distance[close] - exact.min(axis=1)[close])
+        own, _ = to_discs(discs[which], places)
+        np.testing.assert_allclose(np.diagonal(own), distance, atol=1e-4)
+    errors = np.concatenate(errors)
+    assert len(errors) > 2000 and errors.min() > -1e-4
+    assert (errors > 0.001).mean() < 0.01
+
+
+def test_neighbouring_cells_agree_on_the_nodes_that_they_share(refreshed):
+    found = {
+        tuple(cell): distance.reshape(FINE, FINE, FINE)
+        for cell, distance, _, _ in refined_cells(refreshed, 9999)
+    }
+    apart = [
+        np.abs(distance[-1] - found[i + 1, j, k][0])
+        for (i, j, k), distance in found.items()
+        if (i + 1, j, k) in found
+    ]
+    assert len(apart) > 100
+    assert np.quantile(apart, 0.95) < STEP and np.quantile(apart, 0.99) < 0.007
