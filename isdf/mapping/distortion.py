@@ -8,10 +8,11 @@ views find it. Poses err, too: what a small motion of one of the views explains 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 from .facets import Facets
 
@@ -27,9 +28,11 @@ APART, TURNED, KEPT = 0.2, 0.25, 12
 PARALLEL, GAP, GAP_NOISE = 0.95, 0.02, 0.015
 # Standard deviation of the distance of two measured planes [m], plus so much times the squared depth. Squares of one
 # image err together: a pair of views counts as much as SHARE of its squares would alone.
-SIGMA, SIGMA_NOISE, SHARE = 0.004, 0.003, 0.05
+SIGMA, SIGMA_NOISE, SHARE = 0.004, 0.003, 0.1
+# Every so many of a view's squares are compared.
+THINNED = 2
 # Standard deviation of a pose [rad, m].
-ROTATION, TRANSLATION = 0.002, 0.005
+ROTATION, TRANSLATION = 0.005, 0.01
 
 
 class Key(NamedTuple):
@@ -94,10 +97,9 @@ class Distortion:
 
     def relative(self, height: int, width: int) -> Float[np.ndarray, "height width"]:
         """How much too far the camera measures at every pixel, as a share of the depth."""
-        down, across = polynomials(height), polynomials(width)
         weights = np.zeros((DEGREE + 1, DEGREE + 1))
         weights[tuple(np.transpose(POWERS))] = self.coefficients
-        return np.asarray(across @ weights @ down.T).T
+        return np.asarray(_image(polynomials(height), weights.T, polynomials(width)))
 
     def correct(
         self, depth: Float[np.ndarray, "h w"], intrinsics: tuple[float, float, float, float]
@@ -130,17 +132,13 @@ class Distortion:
             self._views = [*self._views, view][-KEPT:]
 
     def _add(self, view: Facets, other: Facets) -> None:
-        rows, motions, gaps = compare(view, other)
-        # Half-squared residuals of a heavy tail (Cauchy): what has moved between the views counts little.
-        residual = gaps - rows @ self.coefficients
-        weight = SHARE / (1 + residual**2 / 4)
-        heavy, moved = rows * weight[:, None], motions * weight[:, None]
+        products = _products(compare(view, other), self.coefficients)
         # The pose's six numbers are solved for and dropped (Schur complement).
         loose = np.diag(1 / np.array([ROTATION] * 3 + [TRANSLATION] * 3) ** 2 / 2)
-        both = moved.T @ rows
-        gain = np.linalg.solve(motions.T @ moved + loose, both).T
-        self.information += heavy.T @ rows - gain @ both
-        self.vector += heavy.T @ gaps - gain @ (moved.T @ gaps)
+        both = products[TERMS:-1, :TERMS]
+        gain = np.linalg.solve(products[TERMS:-1, TERMS:-1] + loose, both).T
+        self.information += products[:TERMS, :TERMS] - gain @ both
+        self.vector += products[:TERMS, -1] - gain @ products[TERMS:-1, -1]
 
 
 def polynomials(count: int) -> Float[np.ndarray, "count degree"]:
@@ -149,16 +147,53 @@ def polynomials(count: int) -> Float[np.ndarray, "count degree"]:
     return np.polynomial.legendre.legvander(middles, DEGREE) * np.sqrt(2 * np.arange(DEGREE + 1) + 1)
 
 
-def compare(
-    view: Facets, other: Facets
-) -> tuple[Float[np.ndarray, "n terms"], Float[np.ndarray, "n 6"], Float[np.ndarray, "n"]]:
+# Matrix products of these sizes are quicker than the threads that numpy would start for them.
+@njit(cache=True, nogil=True)
+@no_type_check
+def _image(down, weights, across):
+    """down @ weights @ across.T."""
+    left, out = np.zeros((len(down), weights.shape[1])), np.zeros((len(down), len(across)))
+    for v in range(len(down)):
+        for i in range(weights.shape[0]):
+            for j in range(weights.shape[1]):
+                left[v, j] += down[v, i] * weights[i, j]
+        for u in range(len(across)):
+            for j in range(weights.shape[1]):
+                out[v, u] += left[v, j] * across[u, j]
+    return out
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _products(equations, coefficients):
+    """Sums of weighted products (m, m) of the columns of the equations (n, m) of `compare`.
+
+    The weights are of a heavy tail (Cauchy): what has moved between the views counts little.
+    """
+    count, columns = equations.shape
+    out = np.zeros((columns, columns))
+    for n in range(count):
+        row = equations[n]
+        residual = row[columns - 1]
+        for i in range(len(coefficients)):
+            residual -= row[i] * coefficients[i]
+        weight = SHARE / (1 + residual * residual / 4)
+        for i in range(columns):
+            scaled = weight * row[i]
+            for j in range(columns):
+                out[i, j] += scaled * row[j]
+    return out
+
+
+def compare(view: Facets, other: Facets) -> Float[np.ndarray, "n columns"]:
     """Where two views show one plane: how its two measurements differ, and what that says of the camera.
 
     Returns:
-        `rows`, `motions` and `gaps`, in standard deviations, with gaps = rows @ coefficients + motions @ (turn, shift)
-        but for noise; turn [rad] and shift [m] move the first view about its own camera.
+        An equation a row, in standard deviations. But for noise, the last column is the sum of the first TERMS, times
+        the camera's coefficients, and of the next six, times a turn [rad] and a shift [m] of the first view about its
+        own camera.
     """
-    at = np.nonzero(view.flat)
+    at = tuple(axis[::THINNED] for axis in np.nonzero(view.flat))
     R, centre = view.pose[:3, :3], view.pose[:3, 3]
     depth = 1 / view.inverse[at]
     ray = view.rays[at] @ R.T
@@ -173,10 +208,9 @@ def compare(
     good = parallel & (np.abs(gap) < GAP + GAP_NOISE * far)
     across = np.einsum("nk,nk->n", ray, normal) * depth
     other_across = np.einsum("nk,nk->n", other_ray, normal) * other_depth
-    rows = across[:, None] * _terms(view, at) - other_across[:, None] * _terms(other, there)
-    motions = np.concatenate([np.cross(point - centre, normal), normal], axis=1)
-    scale = 1 / (SIGMA + SIGMA_NOISE * far[good])
-    return rows[good] * scale[:, None], motions[good] * scale[:, None], gap[good] * scale
+    camera = across[:, None] * _terms(view, at) - other_across[:, None] * _terms(other, there)
+    equations = np.column_stack([camera, np.cross(point - centre, normal), normal, gap])[good]
+    return equations / (SIGMA + SIGMA_NOISE * far[good])[:, None]
 
 
 def _look_up(
