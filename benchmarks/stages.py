@@ -21,6 +21,7 @@ STAGES = {
 MAP_STAGES = {
     "compare": (("mapping/mapper.py", "_appeared"),),
     "fuse": (("mapping/mapper.py", "_fuse"),),
+    "calibrate": (("mapping/distortion.py", "learn"), ("mapping/distortion.py", "correct")),
     "guess": (("mapping/mapper.py", "_guess"),),
     "refresh": (("mapping/refresh.py", "refresh"),),
     "snapshot": (("mapping/mapper.py", "field"),),

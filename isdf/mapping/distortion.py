@@ -79,11 +79,6 @@ class Distortion:
             )
         self._begin()
         self.key, self.information, self.vector = key, information.astype(float), vector.astype(float)
-        if key is not None and information.any():
-            self._factor = self._correction(key.size)
-
-    def _correction(self, size: tuple[int, int]) -> Float[np.ndarray, "h w"]:
-        return (1 / (1 + self.relative(*size))).astype(np.float32)
 
     @property
     def coefficients(self) -> Float[np.ndarray, "terms"]:
@@ -109,8 +104,10 @@ class Distortion:
         if key != self.key:
             self._begin()
             self.key = key
-        if self._factor is None:
+        if not self.information.any():
             return depth
+        if self._factor is None:
+            self._factor = (1 / (1 + self.relative(*key.size))).astype(np.float32)
         return np.asarray(depth * self._factor)
 
     def learn(
@@ -127,7 +124,7 @@ class Distortion:
             self._turn = (self._turn + 1) % len(self._views)
             other = self._views[self._turn]
             self._add(view, other)
-            self._factor = self._correction((depth.shape[0], depth.shape[1]))
+            self._factor = None
         if not self._views or _apart(self._views[-1].pose, T):
             self._views = [*self._views, view][-KEPT:]
 
