@@ -20,6 +20,8 @@ from .slice_geometry import corners, slice_basis
 COLOUR_LIMIT = 1.5
 # In a small region the colours end at this share of its longer side.
 COLOUR_SHARE = 0.25
+# How much it counts that up is where the tops of the images are, against that their right sides are level.
+HELD = 0.01
 # Picture elements along the longer side of a slice in a notebook.
 ELEMENTS = 250
 
@@ -36,15 +38,19 @@ class SliceFigure(Figure):
 def estimate_up(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3"]:
     """The world's up direction, judged by how the cameras were held.
 
-    People and robots hold cameras level, so the mean of the image's up direction is close to up. It snaps to the
-    nearest axis when within 25 degrees, since most worlds are aligned with gravity.
+    People and robots hold cameras level: however far they look down, the right of the image is horizontal. Where it
+    never turns, the mean of the image's up direction decides. It snaps to the nearest axis when within 12 degrees,
+    since most worlds are aligned with gravity.
     """
-    up = -np.asarray(poses)[:, :3, 1].mean(axis=0)
-    up /= np.linalg.norm(up)
+    poses = np.asarray(poses)
+    right, held = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
+    held /= np.linalg.norm(held)
+    _, directions = np.linalg.eigh(right.T @ right / len(right) - HELD * np.outer(held, held))
+    up = directions[:, 0] * np.sign(directions[:, 0] @ held)
     axis = int(np.abs(up).argmax())
-    if abs(up[axis]) > np.cos(np.radians(25)):
+    if abs(up[axis]) > np.cos(np.radians(12)):
         up = np.sign(up[axis]) * np.eye(3)[axis]
-    return up
+    return np.asarray(up)
 
 
 def draw_slice(

@@ -1,6 +1,7 @@
 """Recorded sequences on disk, the two clocks, and the command line on them."""
 
 import json
+import math
 import os
 import time
 from dataclasses import replace
@@ -17,7 +18,7 @@ from isdf.cli import main
 from isdf.datasets import RecordedSequence, SequenceWriter
 from isdf.runner import run_at_rate, run_at_steps, run_every_frame
 from isdf.slices import estimate_up, slice_basis
-from tests.isdf.rooms import furnished_orbit
+from tests.isdf.rooms import furnished_orbit, look_at
 
 # A PNG whose header has no room for what it must say.
 SHORT_HEADER = b"\x89PNG\r\n\x1a\n" + (12).to_bytes(4, "big") + b"IHDR" + bytes(16)
@@ -222,6 +223,12 @@ def test_up_is_judged_from_how_the_camera_is_held() -> None:
     tilt = np.eye(4)
     tilt[:3, :3] = [[1, 0, 0], [0, 0.8, 0.6], [0, -0.6, 0.8]]
     np.testing.assert_allclose(estimate_up(tilt @ poses), [0, 0.6, 0.8], atol=0.05)
+    # A robot that looks down on a table, turning its head a little, or not at all.
+    looks = [look_at((0.0, 0.0, 1.2), (math.cos(a), math.sin(a), 0.5)) for a in np.linspace(-0.4, 0.4, 9)]
+    assert -np.stack(looks)[:, 2, 1].mean() < np.cos(np.radians(25))
+    np.testing.assert_allclose(estimate_up(np.stack(looks)), [0, 0, 1])
+    still = estimate_up(np.stack(looks[4:5]))
+    np.testing.assert_allclose(still, -looks[4][:3, 1], atol=1e-6)
     basis = slice_basis(np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(basis, np.eye(3))
 
