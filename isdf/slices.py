@@ -43,10 +43,11 @@ def estimate_up(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3"]:
     since most worlds are aligned with gravity.
     """
     poses = np.asarray(poses)
+    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     right, held = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
     held /= np.linalg.norm(held)
     _, directions = np.linalg.eigh(right.T @ right / len(right) - HELD * np.outer(held, held))
-    up = directions[:, 0] * np.sign(directions[:, 0] @ held)
+    up = directions[:, 0] if directions[:, 0] @ held >= 0 else -directions[:, 0]
     axis = int(np.abs(up).argmax())
     if abs(up[axis]) > np.cos(np.radians(12)):
         up = np.sign(up[axis]) * np.eye(3)[axis]

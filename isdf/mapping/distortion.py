@@ -8,6 +8,7 @@ views find it. Poses err, too: what a small motion of one of the views explains 
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple, no_type_check
 
 import numpy as np
@@ -15,6 +16,7 @@ from jaxtyping import Float
 from numba import njit
 
 from .facets import Facets
+from .motion import apart
 
 # Products of Legendre polynomials across and down the image, up to this degree together. None is constant: depth that
 # is too long everywhere cannot be told from poses that are too close together.
@@ -125,7 +127,8 @@ class Distortion:
             other = self._views[self._turn]
             self._add(view, other)
             self._factor = None
-        if not self._views or _apart(self._views[-1].pose, T):
+        moved, turned = apart(self._views[-1].pose, T) if self._views else (np.inf, np.inf)
+        if moved > APART or turned > TURNED:
             self._views = [*self._views, view][-KEPT:]
 
     def _add(self, view: Facets, other: Facets) -> None:
@@ -138,6 +141,7 @@ class Distortion:
         self.vector += products[:TERMS, -1] - gain @ products[TERMS:-1, -1]
 
 
+@functools.lru_cache(maxsize=8)
 def polynomials(count: int) -> Float[np.ndarray, "count degree"]:
     """Legendre polynomials at the middles of so many equal parts of [-1, 1], each of mean square 1."""
     middles = (2 * np.arange(count) + 1) / count - 1
@@ -232,9 +236,3 @@ def _terms(view: Facets, at: tuple[np.ndarray, np.ndarray]) -> Float[np.ndarray,
     down, across = (polynomials(n) for n in view.flat.shape)
     i, j = np.transpose(POWERS)
     return across[at[1]][:, i] * down[at[0]][:, j]
-
-
-def _apart(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
-    """Whether two cameras look from different places or in different directions."""
-    cosine = float(a[:3, 2] @ b[:3, 2])
-    return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) > APART or cosine < np.cos(TURNED))

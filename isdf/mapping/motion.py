@@ -73,7 +73,7 @@ class Motion:
         if self._last is None:
             return Verdict(None, False)
         expected = self._expected(moment.time)
-        moved, turned = _apart(expected, moment.pose)
+        moved, turned = apart(expected, moment.pose)
         if moved < NEAR and turned < TURNED:
             return Verdict(None, True)
         steady = moved < NEAR + LEVER * turned
@@ -113,7 +113,7 @@ class Motion:
         return wrong / shared if shared >= max(POINTS, OVERLAP * valid) else None
 
 
-def _apart(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
+def apart(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
     """Distance [m] and angle [rad] between two poses."""
     cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(np.arccos(np.clip(cosine, -1, 1)))

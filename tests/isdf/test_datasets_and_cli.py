@@ -227,6 +227,8 @@ def test_up_is_judged_from_how_the_camera_is_held() -> None:
     looks = [look_at((0.0, 0.0, 1.2), (math.cos(a), math.sin(a), 0.5)) for a in np.linspace(-0.4, 0.4, 9)]
     assert -np.stack(looks)[:, 2, 1].mean() < np.cos(np.radians(25))
     np.testing.assert_allclose(estimate_up(np.stack(looks)), [0, 0, 1])
+    lost = np.full((1, 4, 4), np.nan)
+    np.testing.assert_allclose(estimate_up(np.concatenate([looks, lost])), [0, 0, 1])
     still = estimate_up(np.stack(looks[4:5]))
     np.testing.assert_allclose(still, -looks[4][:3, 1], atol=1e-6)
     basis = slice_basis(np.array([0.0, 0.0, 1.0]))
