@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ..field import AnalyticField, check_points
 from .evidence import FREE_ABOVE
+from .interpolation import PARTS, correction, fine_nodes, may_have_ridge, ridged, trilinear
 from .lately import Lately
-from .lattice import BLOCK, CHUNK, FINE, STEP, LatticeArrays, node_at
+from .lattice import BLOCK, CHUNK, LatticeArrays, node_at
 
 # Below this many points a second thread costs more than it saves.
 PARALLEL = 20_000
@@ -124,9 +125,12 @@ def _query(points, origin, spacing, table, value, block, corrections, distance, 
     """Distances (n,) and gradients (n, 3) of points (n, 3), written in place."""
     nx, ny, nz = CHUNK * table.shape[0], CHUNK * table.shape[1], CHUNK * table.shape[2]
     far = np.float32(1)
-    parts = FINE - 1
     per = np.float32(1 / spacing)
-    scale = np.float32(STEP)
+    parts = np.float32(PARTS)
+    nodes, rows = np.empty((4, 4, 4), dtype=np.float32), np.empty((4, 4, 2), dtype=np.float32)
+    lines = np.empty((4, 3), dtype=np.float32)
+    one, two = np.empty((3, 3, 4), dtype=np.float32), np.empty((3, 4, 4), dtype=np.float32)
+    owners = np.empty((2, 2, 2), dtype=np.int32)
     for n in range(points.shape[0]):
         x = np.float32((points[n, 0] - origin[0]) / spacing)
         y = np.float32((points[n, 1] - origin[1]) / spacing)
@@ -140,7 +144,7 @@ def _query(points, origin, spacing, table, value, block, corrections, distance, 
         cz = min(max(z, np.float32(0)), np.float32(nz - 1))
         i, j, k = min(int(cx), nx - 2), min(int(cy), ny - 2), min(int(cz), nz - 2)
         tx, ty, tz = cx - np.float32(i), cy - np.float32(j), cz - np.float32(k)
-        d, gx, gy, gz = _trilinear(
+        d, gx, gy, gz = trilinear(
             node_at(table, value, i, j, k, far), node_at(table, value, i, j, k + 1, far),
             node_at(table, value, i, j + 1, k, far), node_at(table, value, i, j + 1, k + 1, far),
             node_at(table, value, i + 1, j, k, far), node_at(table, value, i + 1, j, k + 1, far),
@@ -149,34 +153,20 @@ def _query(points, origin, spacing, table, value, block, corrections, distance, 
         )  # fmt: skip
         m = node_at(table, block, i, j, k, np.int32(-1))
         if m >= 0:
-            tx, ty, tz = tx * parts, ty * parts, tz * parts
-            a, b, c = min(int(tx), parts - 1), min(int(ty), parts - 1), min(int(tz), parts - 1)
-            at = a * FINE * FINE + b * FINE + c
-            f = corrections[m]
-            e, ex, ey, ez = _trilinear(
-                np.float32(f[at]), np.float32(f[at + 1]), np.float32(f[at + FINE]), np.float32(f[at + FINE + 1]),
-                np.float32(f[at + FINE * FINE]), np.float32(f[at + FINE * FINE + 1]),
-                np.float32(f[at + FINE * FINE + FINE]), np.float32(f[at + FINE * FINE + FINE + 1]),
-                tx - np.float32(a), ty - np.float32(b), tz - np.float32(c),
-            )  # fmt: skip
-            d += scale * e
-            gx, gy, gz = gx + scale * parts * ex, gy + scale * parts * ey, gz + scale * parts * ez
+            tx, ty, tz = parts * tx, parts * ty, parts * tz
+            a, b, c = min(int(tx), PARTS - 1), min(int(ty), PARTS - 1), min(int(tz), PARTS - 1)
+            tx, ty, tz = tx - np.float32(a), ty - np.float32(b), tz - np.float32(c)
+            if may_have_ridge(corrections, m, a, b, c):
+                fine_nodes(table, value, block, corrections, (i, j, k), (a, b, c), one, two, owners, nodes)
+                d, gx, gy, gz = ridged(nodes, tx, ty, tz, rows, lines)
+                gx, gy, gz = parts * gx, parts * gy, parts * gz
+            else:
+                e, ex, ey, ez = correction(corrections, m, a, b, c, tx, ty, tz)
+                d, gx, gy, gz = d + e, gx + parts * ex, gy + parts * ey, gz + parts * ez
         distance[n] = d
         gradient[n, 0] = gx * per if cx == x else 0.0
         gradient[n, 1] = gy * per if cy == y else 0.0
         gradient[n, 2] = gz * per if cz == z else 0.0
-
-
-@njit(cache=True, nogil=True, inline="always")
-@no_type_check
-def _trilinear(v000, v001, v010, v011, v100, v101, v110, v111, x, y, z):
-    """Value of trilinear interpolation at (x, y, z) in [0, 1]^3 and its three derivatives."""
-    a00, a01, a10, a11 = v001 - v000, v011 - v010, v101 - v100, v111 - v110
-    e00, e01, e10, e11 = v000 + a00 * z, v010 + a01 * z, v100 + a10 * z, v110 + a11 * z
-    b0, b1 = e01 - e00, e11 - e10
-    f0, f1 = e00 + b0 * y, e10 + b1 * y
-    z0, z1 = a00 + (a01 - a00) * y, a10 + (a11 - a10) * y
-    return f0 + (f1 - f0) * x, f1 - f0, b0 + (b1 - b0) * x, z0 + (z1 - z0) * x
 
 
 @njit(cache=True, nogil=True)
@@ -228,7 +218,7 @@ def query_one(lattice: LatticeArrays, point):
         t[axis] = place - at[axis]
     i, j, k = at
     n, v, far = lattice.table, lattice.value, np.float32(1)
-    value, _, _, _ = _trilinear(
+    value, _, _, _ = trilinear(
         node_at(n, v, i, j, k, far), node_at(n, v, i, j, k + 1, far),
         node_at(n, v, i, j + 1, k, far), node_at(n, v, i, j + 1, k + 1, far),
         node_at(n, v, i + 1, j, k, far), node_at(n, v, i + 1, j, k + 1, far),

@@ -15,7 +15,7 @@ from .values import SOLID, Window, fused_at, side_of
 
 # A cell is refined when interpolation misses one of its middles by more than this [m], plus shares of the distance
 # and of what is guessed there.
-TOLERANCE, SLACK, GUESS_SLACK = 0.003, 0.005, 0.15
+TOLERANCE, SLACK, GUESS_SLACK = 0.003, 0.004, 0.05
 # Weights (8, 125) of a cell's corners in trilinear interpolation at its fine nodes.
 _part = np.stack([np.linspace(1, 0, FINE), np.linspace(0, 1, FINE)])
 WEIGHTS = np.einsum("pa,qb,rc->pqrabc", _part, _part, _part).reshape(8, BLOCK).astype(np.float32)

@@ -17,7 +17,8 @@ LARGE_ERROR = 0.05
 # (in measurements at 1 m) that makes the difference; read off seeds of a simulated office.
 SEED_ODDS, FAINT_ODDS, FAINT_WEIGHT = 0.003, 0.15, 0.1
 # In space looked through, a guess that takes off less than this share of its own expected error takes off nothing: the
-# network's sigmoid never reaches zero, but there the median mostly is zero.
+# network's sigmoid never reaches zero, but there the median mostly is zero. Behind a guessed back nothing is taken off
+# either: the network has guessed from the front, and what lies between both is already accounted for.
 LEAST_OF_ERROR = 0.5
 # However sure the network is of a guess, it may err by this share of the gap more than it expects, and so much [m] at
 # most: rooms differ from those it has learned from.
@@ -86,7 +87,7 @@ def coarse_values(window: Window, patches: Patches, bricks: Bricks) -> None:
                 gap = upper - low
                 error = gap * np.exp(window.width[i, j, k]) + min(UNFORESEEN * gap, MOST_UNFORESEEN)
                 share = window.share[i, j, k]
-                if sign > 0 and share < LEAST_OF_ERROR * np.exp(window.width[i, j, k]):
+                if sign > 0 and (weight <= 0 or share < LEAST_OF_ERROR * np.exp(window.width[i, j, k])):
                     share = np.float32(0)
                 window.taken[i, j, k] = 2 * upper if sign < 0 else gap * share
                 window.value[i, j, k] = upper - window.taken[i, j, k]
