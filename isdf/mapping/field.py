@@ -156,7 +156,8 @@ def _query(points, origin, spacing, table, value, block, corrections, distance, 
             tx, ty, tz = parts * tx, parts * ty, parts * tz
             a, b, c = min(int(tx), PARTS - 1), min(int(ty), PARTS - 1), min(int(tz), PARTS - 1)
             tx, ty, tz = tx - np.float32(a), ty - np.float32(b), tz - np.float32(c)
-            if may_have_ridge(corrections, m, a, b, c):
+            inner = 0 < i < nx - 2 and 0 < j < ny - 2 and 0 < k < nz - 2
+            if inner and may_have_ridge(corrections, m, a, b, c):
                 fine_nodes(table, value, block, corrections, (i, j, k), (a, b, c), one, two, owners, nodes)
                 d, gx, gy, gz = ridged(nodes, tx, ty, tz, rows, lines)
                 gx, gy, gz = parts * gx, parts * gy, parts * gz

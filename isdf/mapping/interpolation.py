@@ -7,7 +7,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from .lattice import CHUNK, FINE, STEP, node_at
+from .lattice import FINE, STEP, node_at
 
 # Fine cells a side of a refined cell.
 PARTS = FINE - 1
@@ -147,7 +147,7 @@ def fine_nodes(table, value, block, corrections, cell, part, one, two, rows, out
         value: and
         block: and
         corrections: this.
-        cell: (3,) the refined cell, by its first coarse node.
+        cell: (3,) the refined cell, by its first coarse node; not on the rim of the lattice.
         part: (3,) which of its fine cells, 0 .. 3 along each axis.
         one: (3, 3, 4) to work in, and
         two: (3, 4, 4) and
@@ -155,9 +155,9 @@ def fine_nodes(table, value, block, corrections, cell, part, one, two, rows, out
         out: (4, 4, 4) written [m], by x, y, z.
     """
     # Along each axis they lie in cells i and i + 1, say, of which i + p is the one in the middle; or all in cell i.
-    i, p, nx = _cells_about(cell[0], part[0], CHUNK * table.shape[0])
-    j, q, ny = _cells_about(cell[1], part[1], CHUNK * table.shape[1])
-    k, r, nz = _cells_about(cell[2], part[2], CHUNK * table.shape[2])
+    i, p, nx = _cells_about(cell[0], part[0])
+    j, q, ny = _cells_about(cell[1], part[1])
+    k, r, nz = _cells_about(cell[2], part[2])
     # Place of the first of them in fine steps from the first coarse node.
     x, y, z = part[0] - 1 + PARTS * p, part[1] - 1 + PARTS * q, part[2] - 1 + PARTS * r
     per, parts, far, scale = np.float32(1 / PARTS), np.float32(PARTS), np.float32(1), np.float32(STEP)
@@ -196,10 +196,8 @@ def fine_nodes(table, value, block, corrections, cell, part, one, two, rows, out
 
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def _cells_about(cell, part, size):
-    """First cell, along an axis of so many nodes, that four nodes about a part lie in; how far before; how many."""
-    if part == 0 and cell > 0:
+def _cells_about(cell, part):
+    """First cell along an axis that four nodes about a part lie in, how far before the cell it is, and how many."""
+    if part == 0:
         return cell - 1, 1, 2
-    if part == PARTS - 1 and cell < size - 2:
-        return cell, 0, 2
-    return cell, 0, 1
+    return cell, 0, 2 if part == PARTS - 1 else 1

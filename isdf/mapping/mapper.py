@@ -132,7 +132,7 @@ class Mapper(ShownMapper):
         floor = float(seen[0 if way > 0 else 1, axis])
         self.visitors.watch(depth, appeared, stride, _intrinsics(frame), T, up, floor, frame.time)
         self._fuse(depth, T, frame, box, appeared, stride)
-        self._fused_at = frame.time
+        since, self._fused_at = frame.time - self._fused_at, frame.time
         self._motion.believe(Moment(depth, _intrinsics(frame), T, frame.time))
         self.distortion.learn(measured, _intrinsics(frame), T)
         self.frames_seen += 1
@@ -140,8 +140,7 @@ class Mapper(ShownMapper):
         for part in (box, feet):
             if part is not None:
                 self._touch(part + np.array([[-MARGIN], [MARGIN]]))
-        # A clock that stands still or jumps back must not stop the refreshing.
-        if not self._ready or not 0 < frame.time - self._guessed_at < self.config.guess_period:
+        if self._guess_due(frame.time, since):
             self._guess(T[:3, 3])
             self._guessed_at = frame.time
         self._keep_up(T[:3, 3], frame.time)
@@ -311,9 +310,25 @@ class Mapper(ShownMapper):
         if box is not None:
             self._touch(box)
 
+    def _guess_due(self, now: float, since: float) -> bool:
+        """Whether to guess with a frame that comes so long after the last one [s].
+
+        Soon after a refresh, where frames come often enough: if it were shortly before one, those that have waited for
+        that would wait for the network, too.
+        """
+        soon = self.config.refresh_period / 2
+        wait = self._ready and since < soon and not 0 <= now - self._refreshed_at < soon
+        period = self.config.guess_period
+        period += min(period, self.config.refresh_period) if wait else 0
+        return not self._ready or not 0 < now - self._guessed_at < period
+
+    def _refresh_due(self, now: float) -> bool:
+        # A clock that stands still or jumps back must not stop the refreshing.
+        return not self._ready or not 0 < now - self._refreshed_at < self.config.refresh_period
+
     def _keep_up(self, eye: Float[np.ndarray, "3"], now: float) -> None:
         """Refresh when it is due, whether the newest frame was believed or not."""
-        if not self._ready or not 0 < now - self._refreshed_at < self.config.refresh_period:
+        if self._refresh_due(now):
             left = self.visitors.take_back(eye, now)
             if left is not None:
                 refresh(self.lattice, self.bricks, left + np.array([[-MARGIN], [MARGIN]]))
@@ -344,6 +359,7 @@ def compile_kernels() -> None:
     extend_down(
         mapper.bricks.arrays, none, 1, *vertical(mapper.up), depth.numpy(), intrinsics, np.linalg.inv(T)
     )
+    mapper.distortion.relative(*depth.shape)
     field = mapper.field()
     for dtype in (torch.float32, torch.float64):
         field.distance_and_gradient(torch.zeros(1, 3, dtype=dtype))
