@@ -128,14 +128,19 @@ class BrickVolume:
 
     def add(self, places: Int[np.ndarray, "n 3"]) -> None:
         """Make room for the bricks at these array indices of the table, which must not exist yet."""
-        while self.count + len(places) > len(self._distance):
-            more = np.zeros((max(256, len(self._distance)), VOXELS), dtype=np.float32)
-            self._distance = np.concatenate([self._distance, more])
-            self._weight = np.concatenate([self._weight, more])
-            self._ended = np.concatenate([self._ended, more])
-            self._changes = np.concatenate([self._changes, np.zeros(len(more), dtype=np.int64)])
+        needed, size = self.count + len(places), len(self._distance)
+        if needed > size:
+            size = max(2 * size, needed)
+            self._distance, self._weight = self._longer(self._distance, size), self._longer(self._weight, size)
+            self._ended, self._changes = self._longer(self._ended, size), self._longer(self._changes, size)
         self.table[tuple(places.T)] = np.arange(self.count, self.count + len(places))
         self.count += len(places)
+
+    def _longer(self, values: np.ndarray, size: int) -> np.ndarray:
+        # Of zeros that are asked for, none takes memory or time before it is written: joined to the end they would.
+        out = np.zeros((size, *values.shape[1:]), dtype=values.dtype)
+        out[: self.count] = values[: self.count]
+        return out
 
     def restore(
         self,
