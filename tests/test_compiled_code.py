@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 TESTED = (
     "tests/isdf/test_mapping.py",
+    "tests/isdf/test_interpolation.py",
     "tests/isdf/test_visitors.py",
     "tests/isdf/test_seeds.py",
     "tests/isdf/test_voxel.py",
