@@ -131,8 +131,8 @@ class BrickVolume:
         needed, size = self.count + len(places), len(self._distance)
         if needed > size:
             size = max(2 * size, needed)
-            self._distance, self._weight = self._longer(self._distance, size), self._longer(self._weight, size)
-            self._ended, self._changes = self._longer(self._ended, size), self._longer(self._changes, size)
+            for name in ("_distance", "_weight", "_ended", "_changes"):
+                setattr(self, name, self._longer(getattr(self, name), size))
         self.table[tuple(places.T)] = np.arange(self.count, self.count + len(places))
         self.count += len(places)
 
