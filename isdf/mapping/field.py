@@ -22,9 +22,11 @@ PARALLEL = 20_000
 
 
 class LatticeField(AnalyticField):
-    """Piecewise trilinear distances with confidences; immutable.
+    """Distances and confidences between the nodes of a lattice; immutable.
 
-    Outside the lattice the distance is that of the closest point on its rim, and the gradient across it is zero.
+    Interpolation is trilinear, but where fine nodes show a ridge half way between two surfaces: there the field follows
+    both to where they meet (`isdf.mapping.interpolation`). Outside the lattice the distance is that of the closest
+    point on its rim, and the gradient across it is zero.
 
     Args:
         table: (cx, cy, cz) row of every chunk of 8 x 8 x 8 coarse nodes, -1 where there is none.

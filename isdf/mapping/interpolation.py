@@ -11,7 +11,8 @@ from .lattice import FINE, STEP, node_at
 
 # Fine cells a side of a refined cell.
 PARTS = FINE - 1
-# Below this second difference along an axis, in steps of the corrections, a bend is no ridge but noise.
+# Below this second difference along an axis, in steps of the corrections, a bend is taken for noise, and the field may
+# jump by half of it between fine cells of which one has a ridge.
 BEND = 4
 
 
