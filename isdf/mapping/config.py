@@ -27,7 +27,7 @@ class MapperConfig:
         max_weight: of a voxel, in measurements at 1 m: enough to average the noise.
         fuse_period: least frame time between two images that are fused [s]: those between show hardly more.
         refresh_period: least frame time between two refreshes of the distances [s].
-        guess_period: least frame time between two runs of the network [s]; it waits for the next refresh to be over.
+        guess_period: least frame time between two runs of the network [s]; it waits for the end of a refresh.
         distortion: how large the camera's own low-frequency depth error is expected to be, as a share of the depth
             (standard deviation); the map learns it from the images and frees them of it. 0: depth is taken as it is.
         visitors: what came into free space, was not seen to stay and has been out of view for this long [s], or for as

@@ -316,11 +316,12 @@ class Mapper(ShownMapper):
         Soon after a refresh, where frames come often enough: if it were shortly before one, those that have waited for
         that would wait for the network, too.
         """
-        soon = self.config.refresh_period / 2
-        wait = self._ready and since < soon and not 0 <= now - self._refreshed_at < soon
-        period = self.config.guess_period
-        period += min(period, self.config.refresh_period) if wait else 0
-        return not self._ready or not 0 < now - self._guessed_at < period
+        if not self._ready:
+            return True
+        soon, period = self.config.refresh_period / 2, self.config.guess_period
+        if since < soon and not 0 <= now - self._refreshed_at < soon:
+            period += min(period, self.config.refresh_period)
+        return not 0 < now - self._guessed_at < period
 
     def _refresh_due(self, now: float) -> bool:
         # A clock that stands still or jumps back must not stop the refreshing.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from isdf import DepthFrame, PinholeCamera
+from isdf import DepthFrame, Mapper, PinholeCamera
 
 SDF = Callable[[Tensor], Tensor]
 
@@ -96,3 +96,12 @@ def orbit(sdf: SDF, frames: int, camera: PinholeCamera, fps: float = 10.0) -> li
         target = (eye[0] + math.cos(angle), eye[1] + math.sin(angle), 0.85)
         out.append(render(sdf, look_at(eye, target), camera, i / fps))
     return out
+
+
+def mapped(frames: Sequence[DepthFrame]) -> Mapper:
+    """The default map of some frames."""
+    mapper = Mapper()
+    for frame in frames:
+        mapper.integrate(frame)
+    mapper.refresh()
+    return mapper

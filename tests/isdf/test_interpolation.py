@@ -13,7 +13,7 @@ from isdf.mapping.field import LatticeField
 from isdf.mapping.interpolation import BEND, PARTS, fine_nodes, may_have_ridge, ridged
 from isdf.mapping.lately import Lately
 from isdf.mapping.lattice import CHUNK, FINE, STEP
-from tests.isdf.rooms import box, furnished_orbit, inside_of, look_at, render
+from tests.isdf.rooms import box, furnished_orbit, inside_of, look_at, mapped, render
 
 GRID = np.stack(np.meshgrid(*[np.arange(-1.0, 3.0)] * 3, indexing="ij"), axis=-1)
 
@@ -27,39 +27,39 @@ def at(values, place):
     return ridged(values.astype(np.float32), x, y, z, *room_to_work_in())
 
 
-def planes(rng, count):
-    """Unit normals and offsets of planes that pass near the middle of the cell in the middle."""
-    normals = rng.normal(size=(count, 3))
+def two_planes(seed):
+    """Unit normals of two planes that pass near the middle of the cell in the middle.
+
+    With their heights at the nodes (4, 4, 4, 2), and places in the cell (20, 3) with the heights there (20, 2).
+    """
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(2, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals, 0.3 * rng.normal(size=count)
+    offsets, places = 0.3 * rng.normal(size=2), rng.random((20, 3))
+    return normals, (GRID - 0.5) @ normals.T + offsets, places, (places - 0.5) @ normals.T + offsets
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_ridge_of_two_planes_is_met_exactly(seed):
-    rng = np.random.default_rng(seed)
-    normals, offsets = planes(rng, 2)
-    values = ((GRID - 0.5) @ normals.T + offsets).min(axis=-1)
-    for place in rng.random((20, 3)):
-        each = (place - 0.5) @ normals.T + offsets
-        value, *gradient = at(values, place)
+    normals, values, places, heights = two_planes(seed)
+    for place, each in zip(places, heights, strict=True):
+        value, *gradient = at(values.min(axis=-1), place)
         assert value == pytest.approx(each.min(), abs=1e-5)
         if abs(each[0] - each[1]) > 1e-3:
             assert gradient == pytest.approx(normals[each.argmin()], abs=1e-4)
 
 
-def trilinear(values, place):
+def trilinear(corners, place):
     weights = [np.array([1 - p, p]) for p in place]
-    return np.einsum("abc,a,b,c->", values[1:3, 1:3, 1:3], *weights)
+    return np.einsum("abc,a,b,c->", corners, *weights)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_where_values_bend_up_it_is_trilinear(seed):
     """As at the edges of things, where the surface itself is what bends."""
-    rng = np.random.default_rng(seed)
-    normals, offsets = planes(rng, 2)
-    values = ((GRID - 0.5) @ normals.T + offsets).max(axis=-1)
-    for place in rng.random((20, 3)):
-        assert at(values, place)[0] == pytest.approx(trilinear(values, place), abs=1e-5)
+    values = two_planes(seed)[1].max(axis=-1)
+    for place in two_planes(seed)[2]:
+        assert at(values, place)[0] == pytest.approx(trilinear(values[1:3, 1:3, 1:3], place), abs=1e-5)
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -79,11 +79,7 @@ def test_it_is_continuous_from_cell_to_cell(axis):
 
 @pytest.fixture(scope="module")
 def orbit():
-    mapper = Mapper()
-    for frame in furnished_orbit(16):
-        mapper.integrate(frame)
-    mapper.refresh()
-    return mapper
+    return mapped(furnished_orbit(16))
 
 
 def lattice_of(mapper):
@@ -95,10 +91,8 @@ def lattice_of(mapper):
 
 def fine_value(value, block, corrections, cell, node):
     """Value of fine node (3,) of a cell, by the definition."""
-    share = np.asarray(node) / PARTS
     i, j, k = cell
-    weights = [np.array([1 - s, s]) for s in share]
-    out = np.einsum("abc,a,b,c->", value[i : i + 2, j : j + 2, k : k + 2], *weights)
+    out = trilinear(value[i : i + 2, j : j + 2, k : k + 2], np.asarray(node) / PARTS)
     if block[cell] >= 0:
         out += STEP * corrections[block[cell]].reshape(FINE, FINE, FINE)[tuple(node)]
     return out

@@ -32,18 +32,14 @@ from isdf.mapping.nearest import nearest_points
 from isdf.mapping.seeds import ENDED, surface_seeds
 from isdf.methods import load_map
 from tests.gradients import assert_gradient_matches
-from tests.isdf.rooms import box, furnished_orbit, furnished_room, look_at, render, union
+from tests.isdf.rooms import box, furnished_orbit, furnished_room, look_at, mapped, render, union
 
 CAMERA = PinholeCamera.from_fov(80, 60, math.radians(70))
 
 
 @pytest.fixture(scope="module")
 def orbit():
-    mapper = Mapper()
-    for frame in furnished_orbit(16):
-        mapper.integrate(frame)
-    mapper.refresh()
-    return mapper
+    return mapped(furnished_orbit(16))
 
 
 def visible_points(frames, count, seed=0):
