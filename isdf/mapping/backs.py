@@ -14,7 +14,7 @@ from numba import njit
 
 from .bricks import Bricks, row_of
 from .evidence import FREE_ABOVE
-from .lattice import CHUNK, FINE, LatticeArrays, node_at
+from .lattice import CHUNK, LatticeArrays, node_at
 from .planes import planes
 from .seeds import ENDED
 
@@ -28,8 +28,8 @@ ENOUGH, SHARE = 6, 0.1
 # The back is this much nearer [voxels] than where free space begins behind the first so large share of them: voxels are
 # known to be free from their middles, and those closest behind the board are averaged with views that ended on it.
 BEFORE, FIRST = 0.75, 0.1
-# Each board holds a node of the field at least so far inside [voxels], or it would fall between two of them.
-HELD = 0.3
+# No board is thinner than this [voxels].
+THINNEST = 0.25
 # Up to this depth [voxels] views end on the front itself.
 FRONT = 1.6
 # Depths are counted by this share of a voxel.
@@ -53,7 +53,7 @@ def unseen_backs(
         return seeds
     plane, normal = planes(seeds, bricks.voxel)
     thickness = _thicknesses(seeds, plane, normal, _free_behind(seeds, bricks, lattice), bricks.voxel)
-    return _discs(seeds, thickness[plane], bricks, lattice.spacing / (FINE - 1))
+    return _discs(seeds, thickness[plane], bricks)
 
 
 @njit(cache=True, nogil=True)
@@ -153,43 +153,23 @@ def _thicknesses(seeds, plane, normal, depth, voxel):
             while passed < FIRST * total:
                 bin += 1
                 passed += counts[p, bin]
-            out[p] = voxel * max(0.25, (bin + 0.5) / BINS - BEFORE)
+            out[p] = voxel * max(THINNEST, (bin + 0.5) / BINS - BEFORE)
     return out
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _discs(seeds, thickness, bricks, step):
-    """Discs (m, 8) so far behind the seeds (n, 8) as they are thick (n,), if they are and no view ended there.
-
-    Behind the first node of the field inside them they lie in any case; nodes are a step apart [m].
-    """
+def _discs(seeds, thickness, bricks):
+    """Discs (m, 8) so far behind the seeds (n, 8) as they are thick (n,), if they are and no view ended there."""
     out, count = np.empty((len(seeds), 8), dtype=np.float32), 0
     for s in range(len(seeds)):
         if thickness[s] > 0 and not _ended_behind(bricks, seeds[s], thickness[s]):
-            held = np.float32(HELD * bricks.voxel)
-            thick = max(thickness[s], _to_node(seeds[s], step, held) + held)
             for a in range(3):
-                out[count, a] = seeds[s, a] - thick * seeds[s, 3 + a]
+                out[count, a] = seeds[s, a] - thickness[s] * seeds[s, 3 + a]
                 out[count, 3 + a] = -seeds[s, 3 + a]
             out[count, 6], out[count, 7] = 0, seeds[s, 7]
             count += 1
     return out[:count].copy()
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _to_node(seed, step, held):
-    """How far behind a seed, along its normal, the first plane of nodes lies that is held so far inside [m].
-
-    The planes are those, a step apart, that are across the axis closest to the normal.
-    """
-    a = 3
-    for b in range(4, 6):
-        a = b if abs(seed[b]) > abs(seed[a]) else a
-    way = 1 if seed[a] > 0 else -1
-    place = way * seed[a - 3] - held
-    return (held + place - step * np.floor(place / step)) * abs(seed[a])
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..field import AnalyticField, check_points
 from .evidence import FREE_ABOVE
-from .interpolation import PARTS, correction, fine_nodes, may_have_ridge, ridged, trilinear
+from .interpolation import PARTS, correction, creased, fine_nodes, may_have_crease, trilinear
 from .lately import Lately
 from .lattice import BLOCK, CHUNK, LatticeArrays, node_at
 
@@ -24,9 +24,9 @@ PARALLEL = 20_000
 class LatticeField(AnalyticField):
     """Distances and confidences between the nodes of a lattice; immutable.
 
-    Interpolation is trilinear, but where fine nodes show a ridge half way between two surfaces: there the field follows
-    both to where they meet (`isdf.mapping.interpolation`). Outside the lattice the distance is that of the closest
-    point on its rim, and the gradient across it is zero.
+    Interpolation is trilinear, but where fine nodes show a crease half way between two surfaces, in free space or in
+    something thin: there the field follows both to where they meet (`isdf.mapping.interpolation`). Outside the lattice
+    the distance is that of the closest point on its rim, and the gradient across it is zero.
 
     Args:
         table: (cx, cy, cz) row of every chunk of 8 x 8 x 8 coarse nodes, -1 where there is none.
@@ -158,13 +158,16 @@ def _query(points, origin, spacing, table, value, block, corrections, distance, 
             tx, ty, tz = parts * tx, parts * ty, parts * tz
             a, b, c = min(int(tx), PARTS - 1), min(int(ty), PARTS - 1), min(int(tz), PARTS - 1)
             tx, ty, tz = tx - np.float32(a), ty - np.float32(b), tz - np.float32(c)
-            inner = 0 < i < nx - 2 and 0 < j < ny - 2 and 0 < k < nz - 2
-            if inner and may_have_ridge(corrections, m, a, b, c):
+            e, ex, ey, ez = correction(corrections, m, a, b, c, tx, ty, tz)
+            # Farther out than a step, values that bend up do not meet inside of a solid.
+            crease = may_have_crease(corrections, m, a, b, c, 1) or (
+                parts * (d + e) < spacing and may_have_crease(corrections, m, a, b, c, -1)
+            )
+            if crease and 0 < i < nx - 2 and 0 < j < ny - 2 and 0 < k < nz - 2:
                 fine_nodes(table, value, block, corrections, (i, j, k), (a, b, c), one, two, owners, nodes)
-                d, gx, gy, gz = ridged(nodes, tx, ty, tz, rows, lines)
+                d, gx, gy, gz = creased(nodes, tx, ty, tz, rows, lines)
                 gx, gy, gz = parts * gx, parts * gy, parts * gz
             else:
-                e, ex, ey, ez = correction(corrections, m, a, b, c, tx, ty, tz)
                 d, gx, gy, gz = d + e, gx + parts * ex, gy + parts * ey, gz + parts * ez
         distance[n] = d
         gradient[n, 0] = gx * per if cx == x else 0.0

@@ -1,4 +1,4 @@
-"""Interpolation between the nodes of the lattice, with the ridges that distances have half way between two surfaces."""
+"""Interpolation between the nodes of the lattice, with creases: distances have them half way between two surfaces."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from .lattice import FINE, STEP, node_at
 # Fine cells a side of a refined cell.
 PARTS = FINE - 1
 # Below this second difference along an axis, in steps of the corrections, a bend is taken for noise, and the field may
-# jump by half of it between fine cells of which one has a ridge.
+# jump by half of it between fine cells of which one has a crease.
 BEND = 4
+# Solids thinner than this [m] may be missed between two nodes: lines that do not meet half as deep inside are raised by
+# so many times what is lacking. Meeting on a surface, they are above any chord then, which is half a fine step at most.
+THINNEST, LIFT = 0.005, 8
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -30,32 +33,39 @@ def trilinear(v000, v001, v010, v011, v100, v101, v110, v111, x, y, z):
 
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def ridge(a, b, c, d, t):
-    """Which line to follow at t in [0, 1] between b and c, of four values in a row.
+def crease(a, b, c, d, t):
+    """Which line to follow at t in [0, 1] between b and c, of four distances in a row [m].
 
-    A distance is the least of those to each surface, so its ridges point up. Where the lines through the first two and
-    through the last two values both pass above the chord from b to c, they are two surfaces' distances, and the lower
-    of them holds: f = max(chord, min(left, right)). That is exact for two planes, the chord wherever f bends the other
-    way, and continuous (compare the subcell resolution of Harten, 1989).
+    Where the lines through the first two and through the last two both pass above the chord from b to c, they are the
+    distances of two surfaces, and the lower of them holds: a ridge, f = max(chord, min(left, right)). Inside of solids
+    it is the other way round, a valley: f = min(chord, max(left, right)). So solids too thin to hold a node are found.
+    Outside, values bend up beside the edges of things, but lines meet above zero there; those are raised until the
+    chord is lower. That is exact for two planes, and continuous (compare the subcell resolution of Harten, 1989).
 
     Returns:
-        which pair of neighbours the line goes through (0, 1 or 2), and how far along from the first of them t is.
+        which pair of neighbours the line goes through (0, 1 or 2), how far along from the first of them t is, and by
+        how much the line is raised [m].
     """
-    chord, left, right = b + t * (c - b), b + t * (b - a), c - (np.float32(1) - t) * (d - c)
-    if min(left, right) <= chord:
-        return 1, t
-    if left < right:
-        return 0, t + np.float32(1)
-    return 2, t - np.float32(1)
+    one, zero = np.float32(1), np.float32(0)
+    chord, left, right = b + t * (c - b), b + t * (b - a), c - (one - t) * (d - c)
+    if min(left, right) > chord:
+        return (0, t + one, zero) if left < right else (2, t - one, zero)
+    if max(left, right) < chord:
+        before, after = b - a, d - c
+        meet = b + before * (b + after - c) / max(after - before, np.float32(1e-9))
+        lift = np.float32(LIFT) * max(zero, meet + np.float32(THINNEST / 2))
+        if max(left, right) + lift < chord:
+            return (0, t + one, lift) if left > right else (2, t - one, lift)
+    return 1, t, zero
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def ridged(nodes, x, y, z, rows, lines):
-    """Interpolation of 4 x 4 x 4 nodes in the cell in their middle, with ridges: along z, then y, then x.
+def creased(nodes, x, y, z, rows, lines):
+    """Interpolation of 4 x 4 x 4 nodes in the cell in their middle, with creases: along z, then y, then x.
 
     Args:
-        nodes: (4, 4, 4) values by x, y, z.
+        nodes: (4, 4, 4) distances by x, y, z [m].
         x: place in the middle cell, in [0, 1]; so are
         y: and
         z: this.
@@ -63,24 +73,24 @@ def ridged(nodes, x, y, z, rows, lines):
         lines: (4, 3), too.
 
     Returns:
-        value and its derivatives by x, y and z.
+        value and its derivatives by x, y and z, those of the lines it follows.
     """
     for i in range(4):
         for j in range(4):
             v = nodes[i, j]
-            n, t = ridge(v[0], v[1], v[2], v[3], z)
+            n, t, lift = crease(v[0], v[1], v[2], v[3], z)
             slope = v[n + 1] - v[n]
-            rows[i, j, 0], rows[i, j, 1] = v[n] + t * slope, slope
+            rows[i, j, 0], rows[i, j, 1] = v[n] + t * slope + lift, slope
     for i in range(4):
         v = rows[i]
-        n, t = ridge(v[0, 0], v[1, 0], v[2, 0], v[3, 0], y)
+        n, t, lift = crease(v[0, 0], v[1, 0], v[2, 0], v[3, 0], y)
         slope = v[n + 1, 0] - v[n, 0]
-        lines[i, 0], lines[i, 1] = v[n, 0] + t * slope, slope
+        lines[i, 0], lines[i, 1] = v[n, 0] + t * slope + lift, slope
         lines[i, 2] = v[n, 1] + t * (v[n + 1, 1] - v[n, 1])
-    n, t = ridge(lines[0, 0], lines[1, 0], lines[2, 0], lines[3, 0], x)
+    n, t, lift = crease(lines[0, 0], lines[1, 0], lines[2, 0], lines[3, 0], x)
     a, b = lines[n], lines[n + 1]
     slope = b[0] - a[0]
-    return a[0] + t * slope, slope, a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2])
+    return a[0] + t * slope + lift, slope, a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2])
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -111,30 +121,32 @@ def correction(corrections, m, a, b, c, x, y, z):
 
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def may_have_ridge(corrections, m, a, b, c):
-    """Whether values bend down at both ends of an edge of fine cell a, b, c of refined cell m, as far as it can tell.
+def may_have_crease(corrections, m, a, b, c, way):
+    """Whether values bend at both ends of an edge of fine cell a, b, c of refined cell m, as far as it can tell.
 
-    Straight lines between the coarse nodes do not bend, so corrections tell. Ends on its rim bend by what lies beyond.
+    They bend down if `way` is 1, up if it is -1. Straight lines between the coarse nodes do not bend, so corrections
+    tell. Ends on its rim bend by what lies beyond.
     """
     at = (a * FINE + b) * FINE + c
     return (
-        _bends(corrections, m, at, a, FINE * FINE, FINE, 1)
-        or _bends(corrections, m, at, b, FINE, FINE * FINE, 1)
-        or _bends(corrections, m, at, c, 1, FINE * FINE, FINE)
+        _bends(corrections, m, at, a, FINE * FINE, FINE, 1, way)
+        or _bends(corrections, m, at, b, FINE, FINE * FINE, 1, way)
+        or _bends(corrections, m, at, c, 1, FINE * FINE, FINE, way)
     )
 
 
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def _bends(f, m, at, part, along, aside, over):
+def _bends(f, m, at, part, along, aside, over, way):
     """Whether any of the four edges in one direction does; neighbours along and across them are so far apart."""
     found = False
     for u in range(2):
         for v in range(2):
             n = at + u * aside + v * over
             slope = f[m, n + along] - f[m, n]
-            low = part == 0 or f[m, n] - f[m, n - along] - slope > BEND
-            found |= low and (part == PARTS - 1 or slope - f[m, n + 2 * along] + f[m, n + along] > BEND)
+            low = part == 0 or way * (f[m, n] - f[m, n - along] - slope) > BEND
+            high = part == PARTS - 1 or way * (slope - f[m, n + 2 * along] + f[m, n + along]) > BEND
+            found |= low and high
     return found
 
 

@@ -1,4 +1,4 @@
-"""Ridges: half way between two surfaces the field follows both of them, not the chord across."""
+"""Creases: half way between two surfaces the field follows both of them, not the chord across."""
 
 import math
 
@@ -10,7 +10,16 @@ from scipy.interpolate import RegularGridInterpolator
 
 from isdf import Mapper, PinholeCamera
 from isdf.mapping.field import LatticeField
-from isdf.mapping.interpolation import BEND, PARTS, fine_nodes, may_have_ridge, ridged
+from isdf.mapping.interpolation import (
+    BEND,
+    LIFT,
+    PARTS,
+    THINNEST,
+    crease,
+    creased,
+    fine_nodes,
+    may_have_crease,
+)
 from isdf.mapping.lately import Lately
 from isdf.mapping.lattice import CHUNK, FINE, STEP
 from tests.isdf.rooms import box, furnished_orbit, inside_of, look_at, mapped, render
@@ -24,7 +33,7 @@ def room_to_work_in():
 
 def at(values, place):
     x, y, z = (np.float32(p) for p in place)
-    return ridged(values.astype(np.float32), x, y, z, *room_to_work_in())
+    return creased(values.astype(np.float32), x, y, z, *room_to_work_in())
 
 
 def two_planes(seed):
@@ -39,14 +48,54 @@ def two_planes(seed):
     return normals, (GRID - 0.5) @ normals.T + offsets, places, (places - 0.5) @ normals.T + offsets
 
 
+# Far enough inside of solids, or outside of them, that the sides of two planes do not matter.
+DEEP, FAR = -5.0, 5.0
+
+
 @pytest.mark.parametrize("seed", range(20))
-def test_the_ridge_of_two_planes_is_met_exactly(seed):
+@pytest.mark.parametrize("least", [True, False], ids=["ridge", "valley"])
+def test_the_crease_of_two_planes_is_met_exactly(seed, least):
+    """In free space it is the lower of both that holds, inside of solids the higher."""
     normals, values, places, heights = two_planes(seed)
+    values = values.min(axis=-1) + FAR if least else values.max(axis=-1) + DEEP
     for place, each in zip(places, heights, strict=True):
-        value, *gradient = at(values.min(axis=-1), place)
-        assert value == pytest.approx(each.min(), abs=1e-5)
+        value, *gradient = at(values, place)
+        assert value == pytest.approx(each.min() + FAR if least else each.max() + DEEP, abs=1e-5)
         if abs(each[0] - each[1]) > 1e-3:
-            assert gradient == pytest.approx(normals[each.argmin()], abs=1e-4)
+            holds = each.argmin() if least else each.argmax()
+            assert gradient == pytest.approx(normals[holds], abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_board_between_the_nodes_is_met_exactly(seed):
+    """Nodes 4 cm apart, on the axis closest to its normal none inside of a board 2 cm thick."""
+    rng = np.random.default_rng(seed)
+    normal = rng.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    places = rng.random((50, 3))
+    heights, values = 0.04 * (places - 0.5) @ normal, 0.04 * (GRID - 0.5) @ normal
+    inside = 0
+    for place, height in zip(places, heights, strict=True):
+        value, *gradient = at(np.abs(values) - 0.01, place)
+        assert value == pytest.approx(abs(height) - 0.01, abs=1e-5)
+        if abs(height) > 1e-4:
+            assert gradient == pytest.approx(0.04 * np.sign(height) * normal, abs=1e-5)
+        inside += value < 0
+    assert inside > 5
+
+
+def test_as_a_board_vanishes_the_field_rises_to_the_chord_without_a_jump():
+    depths, step = np.arange(-0.01, 0.01, 1e-4), 0.04
+    middle = []
+    for depth in depths:
+        row = [np.float32(step * abs(n - 0.5) + depth) for n in range(-1, 3)]
+        n, t, lift = crease(*row, np.float32(0.5))
+        middle.append(row[n] + t * (row[n + 1] - row[n]) + lift)
+    middle = np.array(middle)
+    board = depths < -THINNEST / 2
+    assert middle[board] == pytest.approx(depths[board], abs=1e-6)
+    assert middle[depths > 0] == pytest.approx(step / 2 + depths[depths > 0], abs=1e-6)
+    assert (np.diff(middle) > 0).all() and np.diff(middle).max() < (LIFT + 1.01) * 1e-4
 
 
 def trilinear(corners, place):
@@ -55,9 +104,9 @@ def trilinear(corners, place):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_where_values_bend_up_it_is_trilinear(seed):
-    """As at the edges of things, where the surface itself is what bends."""
-    values = two_planes(seed)[1].max(axis=-1)
+def test_where_values_bend_up_outside_of_solids_it_is_trilinear(seed):
+    """As beside the edges of things, where distances are round."""
+    values = two_planes(seed)[1].max(axis=-1) + FAR
     for place in two_planes(seed)[2]:
         assert at(values, place)[0] == pytest.approx(trilinear(values[1:3, 1:3, 1:3], place), abs=1e-5)
 
@@ -66,7 +115,7 @@ def test_where_values_bend_up_it_is_trilinear(seed):
 def test_it_is_continuous_from_cell_to_cell(axis):
     rng = np.random.default_rng(axis)
     for _ in range(20):
-        values = rng.random((5, 5, 5))
+        values = rng.random((5, 5, 5)) - 0.5
         below, above = np.delete(values, 4, axis=axis), np.delete(values, 0, axis=axis)
         for other in {0, 1, 2} - {axis}:
             below, above = np.delete(below, 4, axis=other), np.delete(above, 4, axis=other)
@@ -138,11 +187,11 @@ def test_at_the_end_of_the_lattice_nothing_beyond_is_read(corner):
 
 
 @njit(nogil=True, cache=True)
-def asked(corrections, a, b, c):
-    return may_have_ridge(corrections, 0, a, b, c)
+def asked(corrections, a, b, c, way):
+    return may_have_crease(corrections, 0, a, b, c, way)
 
 
-def bends_down(block, cell):
+def bends(block, cell):
     """Whether both ends of any edge of a fine cell bend down by more than `BEND`; its rim may by what lies beyond."""
     for axis in range(3):
         turned = np.moveaxis(block, axis, 0)
@@ -157,13 +206,14 @@ def bends_down(block, cell):
     return False
 
 
-def test_only_where_values_bend_down_are_neighbours_asked():
+@pytest.mark.parametrize("way", [1, -1], ids=["down", "up"])
+def test_only_where_values_bend_are_neighbours_asked(way):
     rng, found = np.random.default_rng(0), 0
     for _ in range(60):
         block = rng.integers(-2, 3, (FINE, FINE, FINE))
         for cell in np.ndindex(PARTS, PARTS, PARTS):
-            expected = bends_down(block, cell)
-            assert asked(block.reshape(1, -1).astype(np.int8), *cell) == expected
+            expected = bends(way * block, cell)
+            assert asked(block.reshape(1, -1).astype(np.int8), *cell, way) == expected
             found += expected
     assert 200 < found < 60 * PARTS**3 - 200
 
