@@ -43,6 +43,8 @@ MOMENTS = 5
 DRAWN = 500
 # How much visible places count in the loss, compared with all.
 LOOKS_COUNT = 4.0
+# How much 1 - cos between the guess's gradient and the true one counts, compared with a metre of error.
+GRADIENT_COUNTS = 0.075
 # Truth is asked for this far into walls and floor [m]; beyond them there is nothing to know.
 INTO_WALLS = 0.3
 # The learning rate rises for so many steps.
@@ -189,26 +191,56 @@ def predicted(net: CompletionNet, window: Window) -> tuple[torch.Tensor, torch.T
 def score(net: CompletionNet, window: Window) -> tuple[torch.Tensor, float]:
     """Loss and mean error [m] where there is something to guess.
 
-    The loss is the likelihood of a Laplace distribution: its location learns the median, its width the error. Space
-    that was looked through counts as much as all there is, by how often it was looked at.
+    The loss is the likelihood of a Laplace distribution: its location learns the median, its width the error. To it
+    comes how far the gradient is turned away from the true one.
     """
     f, width, gap = predicted(net, window)
     here = window.mask & (gap > LEAST_GAP)
     error, gap = (f - window.truth).abs()[here], gap[here]
     width = width[here] + gap.log()
-    looks = window.looks[here]
-    weight = 1 / max(1, len(looks)) + LOOKS_COUNT * looks / window.looks.sum().clamp(min=1)
     relative = error * torch.exp(-width.clamp(min=np.log(0.01)))
-    loss = (weight * (4 * error + 0.1 * (relative + width))).sum()
+    away, known = turned_away(f, window)
+    known &= here
+    loss = (counts(window, here) * (4 * error + 0.1 * (relative + width))).sum()
+    loss += 4 * GRADIENT_COUNTS * (counts(window, known) * away[known]).sum()
     return loss, float(error.detach().mean()) if len(error) else 0.0
+
+
+def counts(window: Window, here: torch.Tensor) -> torch.Tensor:
+    """How much each of the nodes counts, which are those of a mask (nx, ny, nz).
+
+    Space that was looked through counts as much as all there is, by how often it was looked at.
+    """
+    looks = window.looks[here]
+    return 1 / max(1, len(looks)) + LOOKS_COUNT * looks / window.looks.sum().clamp(min=1)
+
+
+def turned_away(f: torch.Tensor, window: Window) -> tuple[torch.Tensor, torch.Tensor]:
+    """1 - cos between the gradients of distances f (nx, ny, nz) and the true ones, and where that is known.
+
+    Gradients are differences to the next node along each axis.
+    """
+    known = window.mask.clone()
+    for axis in range(3):
+        known &= window.mask.roll(-1, axis)
+        known.select(axis, -1)[:] = False
+    ours, true = (torch.stack([d.roll(-1, axis) - d for axis in range(3)]) for d in (f, window.truth))
+    # The small number keeps slopes of flat places from being divided by nothing.
+    cos = (ours * true).sum(dim=0) / (ours.square().sum(dim=0) * true.square().sum(dim=0) + 1e-8).sqrt()
+    return 1 - cos, known
+
+
+def mean(values: torch.Tensor, weight: torch.Tensor) -> float:
+    """Weighted mean, 0 where nothing weighs."""
+    return float((weight * values).sum() / weight.sum().clamp(min=1))
 
 
 @torch.no_grad()
 def judged(net: CompletionNet, files: list[Path]) -> str:
     """Errors [cm] of the upper bound, of the network and of what the map makes of it, where they are judged.
 
-    In visible space by how often it was looked at, and in space not looked at, by kind of way; then what share of
-    visible places is over-estimated by more than 5 cm.
+    In visible space by how often it was looked at, and in space not looked at, by kind of way; then, of visible places,
+    how far the gradient is turned away, and what share is over-estimated by more than 5 cm.
     """
     rows: dict[str, list[list[float]]] = {}
     for file in files:
@@ -220,18 +252,18 @@ def judged(net: CompletionNet, files: list[Path]) -> str:
         visible = window.looks * window.mask
         row = []
         for weight in (visible, unseen):
-            total = weight.sum().clamp(min=1)
-            row += [100 * float((weight * (g - window.truth).abs()).sum() / total) for g in (upper, f, kept)]
-        over = [
-            100 * float((visible * (g - window.truth > UNSAFE)).sum() / visible.sum()) for g in (upper, kept)
-        ]
-        rows.setdefault(file.name.split("_")[1], []).append(row + over)
+            row += [100 * mean((g - window.truth).abs(), weight) for g in (upper, f, kept)]
+        for g in (upper, kept):
+            away, known = turned_away(g, window)
+            row.append(mean(away, visible * known))
+        row += [100 * mean((g - window.truth > UNSAFE).float(), visible) for g in (upper, kept)]
+        rows.setdefault(file.name.split("_")[1], []).append(row)
     lines = []
     for kind, values in sorted(rows.items()):
-        mean = np.mean(values, axis=0)
+        m = np.mean(values, axis=0)
         lines.append(
-            f"  {kind:>6} ({len(values):3d}): visible {mean[0]:.2f} -> {mean[1]:.2f} ({mean[2]:.2f} in the map), "
-            f"unseen {mean[3]:.1f} -> {mean[4]:.1f}, over {mean[6]:.1f} -> {mean[7]:.1f} %"
+            f"  {kind:>6} ({len(values):3d}): visible {m[0]:.2f} -> {m[1]:.2f} ({m[2]:.2f} in the map), "
+            f"unseen {m[3]:.1f} -> {m[4]:.1f}, 1 - cos {m[6]:.4f} -> {m[7]:.4f}, over {m[8]:.1f} -> {m[9]:.1f} %"
         )
     return "\n".join(lines)
 

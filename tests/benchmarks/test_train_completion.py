@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 
 from benchmarks.camera_ways import camera_way
 from benchmarks.random_rooms import depth_image, random_room
-from benchmarks.train_completion import Data, Train, turned, windows
+from benchmarks.train_completion import Data, Train, Window, score, turned, turned_away, windows
 from isdf.mapping.completion import CHANNELS, STRIDE, CompletionNet
 
 
@@ -47,6 +47,39 @@ def test_turning_a_window_turns_its_directions():
             slope = other.x[0].diff(dim=axis).narrow(1 - axis, 0, 8)
             along = other.x[4 + axis].narrow(axis, 0, slope.shape[axis]).narrow(1 - axis, 0, 8)
             assert (slope * along).sum() < 0
+
+
+def slope(direction, shape=(8, 8, 8)):
+    """Distances of nodes from a plane across a direction (3,)."""
+    places = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij"), dim=-1).float()
+    return 0.16 * places @ torch.tensor(direction)
+
+
+def window_of(truth):
+    """One in which all is known, and nothing proven but that distances are less than 2 m off the truth."""
+    x, all_of_it = torch.zeros(CHANNELS, *truth.shape), torch.ones_like(truth)
+    x[0], x[1] = truth + 2, truth - 2
+    return Window(x, truth, all_of_it.bool(), all_of_it)
+
+
+def test_gradients_are_compared_between_nodes_that_are_known():
+    window = window_of(slope((1.0, 0.0, 0.0)))
+    window.mask[2, 3, 4] = False
+    away, known = turned_away(slope((0.6, 0.8, 0.0)), window)
+    torch.testing.assert_close(away[known], torch.full_like(away[known], 0.4), atol=1e-4, rtol=0)
+    assert known.sum() == 7**3 - 4 and not known[2, 3, 4] and not known[1, 3, 4] and known[3, 3, 4]
+
+
+def test_of_guesses_equally_far_off_the_one_with_the_better_gradient_wins():
+    window = window_of(slope((1.0, 0.0, 0.0)))
+    off = torch.full(window.truth.shape, 0.05)
+    wavy = off * (1 - 2 * (torch.arange(8) % 2))
+
+    def loss(error):
+        share = (2 - error) / 4
+        return float(score(lambda x: (share[None], torch.full_like(share, -3.0)[None]), window)[0])
+
+    assert loss(off) < loss(wavy) - 0.005
 
 
 def test_a_network_is_trained_from_windows_on_disk(tmp_path: Path):
