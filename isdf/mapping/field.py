@@ -7,7 +7,7 @@ from typing import Any, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int8, UInt8
+from jaxtyping import Bool, Float, Int, Int8, Int16, UInt8
 from numba import njit
 from torch import Tensor
 
@@ -15,7 +15,7 @@ from ..field import AnalyticField, check_points
 from .evidence import FREE_ABOVE
 from .interpolation import PARTS, correction, creased, fine_nodes, may_have_crease, trilinear
 from .lately import Lately
-from .lattice import BLOCK, CHUNK, LatticeArrays, node_at
+from .lattice import BLOCK, CHUNK, LatticeArrays, distance_at, node_at
 
 # Below this many points a second thread costs more than it saves.
 PARALLEL = 20_000
@@ -30,7 +30,7 @@ class LatticeField(AnalyticField):
 
     Args:
         table: (cx, cy, cz) row of every chunk of 8 x 8 x 8 coarse nodes, -1 where there is none.
-        value: (rows, 512) signed distances at the coarse nodes [m].
+        value: (rows, 512) signed distances at the coarse nodes, in `lattice.UNIT`s.
         confidence: of the same nodes, 255 is 1.
         block: of the same nodes: row of the cell's corrections, -1 where there are none.
         corrections: (n, 125) what trilinear interpolation misses at the fine nodes of a cell, in `lattice.STEP`s.
@@ -46,7 +46,7 @@ class LatticeField(AnalyticField):
     def __init__(
         self,
         table: Int[np.ndarray, "cx cy cz"],
-        value: Float[np.ndarray, "rows 512"],
+        value: Int16[np.ndarray, "rows 512"],
         confidence: UInt8[np.ndarray, "rows 512"],
         block: Int[np.ndarray, "rows 512"],
         corrections: Int8[np.ndarray, "n 125"],
@@ -126,7 +126,6 @@ class LatticeField(AnalyticField):
 def _query(points, origin, spacing, table, value, block, corrections, distance, gradient):
     """Distances (n,) and gradients (n, 3) of points (n, 3), written in place."""
     nx, ny, nz = CHUNK * table.shape[0], CHUNK * table.shape[1], CHUNK * table.shape[2]
-    far = np.float32(1)
     per = np.float32(1 / spacing)
     parts = np.float32(PARTS)
     nodes, rows = np.empty((4, 4, 4), dtype=np.float32), np.empty((4, 4, 2), dtype=np.float32)
@@ -147,10 +146,10 @@ def _query(points, origin, spacing, table, value, block, corrections, distance, 
         i, j, k = min(int(cx), nx - 2), min(int(cy), ny - 2), min(int(cz), nz - 2)
         tx, ty, tz = cx - np.float32(i), cy - np.float32(j), cz - np.float32(k)
         d, gx, gy, gz = trilinear(
-            node_at(table, value, i, j, k, far), node_at(table, value, i, j, k + 1, far),
-            node_at(table, value, i, j + 1, k, far), node_at(table, value, i, j + 1, k + 1, far),
-            node_at(table, value, i + 1, j, k, far), node_at(table, value, i + 1, j, k + 1, far),
-            node_at(table, value, i + 1, j + 1, k, far), node_at(table, value, i + 1, j + 1, k + 1, far),
+            distance_at(table, value, i, j, k), distance_at(table, value, i, j, k + 1),
+            distance_at(table, value, i, j + 1, k), distance_at(table, value, i, j + 1, k + 1),
+            distance_at(table, value, i + 1, j, k), distance_at(table, value, i + 1, j, k + 1),
+            distance_at(table, value, i + 1, j + 1, k), distance_at(table, value, i + 1, j + 1, k + 1),
             tx, ty, tz,
         )  # fmt: skip
         m = node_at(table, block, i, j, k, np.int32(-1))
@@ -223,12 +222,12 @@ def query_one(lattice: LatticeArrays, point):
         at[axis] = int(place)
         t[axis] = place - at[axis]
     i, j, k = at
-    n, v, far = lattice.table, lattice.value, np.float32(1)
+    n, v = lattice.table, lattice.value
     value, _, _, _ = trilinear(
-        node_at(n, v, i, j, k, far), node_at(n, v, i, j, k + 1, far),
-        node_at(n, v, i, j + 1, k, far), node_at(n, v, i, j + 1, k + 1, far),
-        node_at(n, v, i + 1, j, k, far), node_at(n, v, i + 1, j, k + 1, far),
-        node_at(n, v, i + 1, j + 1, k, far), node_at(n, v, i + 1, j + 1, k + 1, far),
+        distance_at(n, v, i, j, k), distance_at(n, v, i, j, k + 1),
+        distance_at(n, v, i, j + 1, k), distance_at(n, v, i, j + 1, k + 1),
+        distance_at(n, v, i + 1, j, k), distance_at(n, v, i + 1, j, k + 1),
+        distance_at(n, v, i + 1, j + 1, k), distance_at(n, v, i + 1, j + 1, k + 1),
         t[0], t[1], t[2],
     )  # fmt: skip
     i, j, k = i + int(t[0] > 0.5), j + int(t[1] > 0.5), k + int(t[2] > 0.5)

@@ -7,7 +7,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from .lattice import FINE, STEP, node_at
+from .lattice import FINE, STEP, distance_at, node_at
 
 # Fine cells a side of a refined cell.
 PARTS = FINE - 1
@@ -173,14 +173,14 @@ def fine_nodes(table, value, block, corrections, cell, part, one, two, rows, out
     k, r, nz = _cells_about(cell[2], part[2])
     # Place of the first of them in fine steps from the first coarse node.
     x, y, z = part[0] - 1 + PARTS * p, part[1] - 1 + PARTS * q, part[2] - 1 + PARTS * r
-    per, parts, far, scale = np.float32(1 / PARTS), np.float32(PARTS), np.float32(1), np.float32(STEP)
+    per, parts, scale = np.float32(1 / PARTS), np.float32(PARTS), np.float32(STEP)
     for a in range(nx + 1):
         for b in range(ny + 1):
             v0, v1 = (
-                node_at(table, value, i + a, j + b, k, far),
-                node_at(table, value, i + a, j + b, k + 1, far),
+                distance_at(table, value, i + a, j + b, k),
+                distance_at(table, value, i + a, j + b, k + 1),
             )
-            v2 = node_at(table, value, i + a, j + b, k + 2, far) if nz > 1 else v1
+            v2 = distance_at(table, value, i + a, j + b, k + 2) if nz > 1 else v1
             for w in range(4):
                 n = np.float32(z + w)
                 one[a, b, w] = v0 + per * n * (v1 - v0) if n <= parts else v1 + per * (n - parts) * (v2 - v1)

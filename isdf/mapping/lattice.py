@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int16
 from numba import njit
 
 from ..errors import FrameError
@@ -19,15 +19,17 @@ from .pool import Pool, Readers
 # Fine nodes a side of a refined cell: a cell of four fine steps shares its faces with its neighbours.
 FINE = 5
 BLOCK = FINE**3
-# Steps of the stored corrections of a refined cell [m].
-STEP = 0.0012
+# Steps of the stored corrections of a refined cell, and of the stored distances at coarse nodes [m].
+STEP, UNIT = 0.0012, 0.00025
+# Distance [m] where nothing is known.
+FAR = 1.0
 # Coarse nodes a side of a chunk; compiled code shifts and masks by it.
 CHUNK = 8
 # Most chunks that the box about the map may have room for, at four bytes each where nothing is.
 MAX_CHUNKS = 4_000_000
 # What is kept of a node: its type, and what holds where nothing was written. Snapshots read those published.
 NODES: dict[str, tuple[Any, float]] = {
-    "value": (np.float32, 1.0),
+    "value": (np.int16, FAR / UNIT),
     "confidence": (np.uint8, 0.0),
     "block": (np.int32, -1.0),
     "evidence": (np.uint8, 0.0),
@@ -44,7 +46,7 @@ class LatticeArrays(NamedTuple):
         origin: (3,) world position of the first node [m].
         spacing: of coarse nodes [m].
         table: (cx, cy, cz) int32 row of every chunk, -1 where there is none.
-        value: (rows, 512) float32 [m].
+        value: (rows, 512) int16 distances in `UNIT`s, see `distance_at`.
         confidence: (rows, 512) uint8.
         evidence: (rows, 512) uint8, see `isdf.mapping.evidence`.
     """
@@ -182,6 +184,12 @@ class Lattice:
         )
 
 
+def in_units(values: Float[np.ndarray, "nx ny nz"]) -> Int16[np.ndarray, "nx ny nz"]:
+    """Distances [m] as they are stored; beyond 8 m they are cut off."""
+    most = np.iinfo(np.int16).max
+    return np.clip(np.rint(values / UNIT), -most, most).astype(np.int16)
+
+
 def _bits(values: np.ndarray) -> np.ndarray:
     """The same memory, as a type that compiled code knows: half precision it does not."""
     return values.view(np.uint16) if values.dtype == np.float16 else values
@@ -195,6 +203,13 @@ def node_at(table, values, i, j, k, empty):
     if row < 0:
         return empty
     return values[row, ((i & 7) << 6) | ((j & 7) << 3) | (k & 7)]
+
+
+@njit(cache=True, nogil=True, inline="always")
+@no_type_check
+def distance_at(table, value, i, j, k):
+    """Distance [m] at the node at an array index of the lattice, `FAR` where there is no chunk."""
+    return np.float32(UNIT) * np.float32(node_at(table, value, i, j, k, np.int16(round(FAR / UNIT))))
 
 
 @njit(cache=True, nogil=True)

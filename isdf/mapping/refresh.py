@@ -13,7 +13,7 @@ from .backs import unseen_backs
 from .bricks import BrickVolume
 from .completion import STRIDE, CompletionNet, features
 from .evidence import Evidence, bounds, gather
-from .lattice import FINE, Lattice
+from .lattice import FINE, Lattice, in_units
 from .nearest import finer_nearest
 from .patches import Patches, in_cubes
 from .refinement import cells_to_refine, middle_values, near_known, refined_values
@@ -188,5 +188,6 @@ def refresh(lattice: Lattice, bricks: BrickVolume, box: Box) -> bool:
     written = inner & refine & ((window.block < 0) | stale)
     lattice.reassign(window.block, written, inner & ~refine)
     refined_values(window, patches, bricks.arrays, miss, np.argwhere(written), lattice.corrections)
-    lattice.write(begin, end, value=window.value, confidence=window.confidence, block=window.block)
+    value = in_units(window.value)
+    lattice.write(begin, end, value=value, confidence=window.confidence, block=window.block)
     return True

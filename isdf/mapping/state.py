@@ -20,7 +20,7 @@ from .lattice import BLOCK, CHUNK, NODES
 from .mapper import Mapper
 
 FORMAT = "isdf-lattice-map"
-VERSION = 5
+VERSION = 6
 
 
 def save(mapper: Mapper, path: Path, note: Mapping[str, Any]) -> None:

@@ -21,7 +21,7 @@ from isdf.mapping.interpolation import (
     may_have_crease,
 )
 from isdf.mapping.lately import Lately
-from isdf.mapping.lattice import CHUNK, FINE, STEP
+from isdf.mapping.lattice import CHUNK, FINE, STEP, UNIT
 from tests.isdf.rooms import box, furnished_orbit, inside_of, look_at, mapped, render
 
 GRID = np.stack(np.meshgrid(*[np.arange(-1.0, 3.0)] * 3, indexing="ij"), axis=-1)
@@ -135,7 +135,7 @@ def lattice_of(mapper):
     """Coarse values and rows of corrections as dense arrays, and the corrections."""
     lattice, begin = mapper.lattice, np.zeros(3, dtype=int)
     end = np.array(lattice.shape)
-    return lattice.read("value", begin, end), lattice.read("block", begin, end), lattice.corrections
+    return UNIT * lattice.read("value", begin, end), lattice.read("block", begin, end), lattice.corrections
 
 
 def fine_value(value, block, corrections, cell, node):
@@ -169,7 +169,7 @@ def test_fine_nodes_are_those_of_the_cell_and_of_those_beside_it(orbit):
 def test_at_the_end_of_the_lattice_nothing_beyond_is_read(corner):
     """One refined cell in a corner of a lattice of one chunk: no row of corrections follows its own."""
     cell = tuple((CHUNK - 2) * c for c in corner)
-    value, block = np.zeros((1, CHUNK**3), np.float32), np.full((1, CHUNK**3), -1, np.int32)
+    value, block = np.zeros((1, CHUNK**3), np.int16), np.full((1, CHUNK**3), -1, np.int32)
     block.reshape(CHUNK, CHUNK, CHUNK)[cell] = 0
     corrections = np.zeros((1, FINE**3), np.int8)
     corrections[0, :: FINE // 2] = 50

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from isdf import FrameError
-from isdf.mapping.lattice import CHUNK, Lattice
+from isdf.mapping.lattice import CHUNK, FAR, UNIT, Lattice, in_units
 
 
 class Reader:
@@ -25,24 +25,31 @@ def lattice_of(side: float) -> Lattice:
 
 
 def fill(lattice: Lattice, begin: int, end: int, value: float) -> None:
-    window = np.full((end - begin,) * 3, value, dtype=np.float32)
-    lattice.write(np.full(3, begin), np.full(3, end), value=window)
+    window = np.full((end - begin,) * 3, value)
+    lattice.write(np.full(3, begin), np.full(3, end), value=in_units(window))
 
 
 def test_what_was_written_is_read_across_chunks_and_nothing_else():
     lattice = lattice_of(4.0)
     rng, begin, end = np.random.default_rng(0), np.array([3, 6, 1]), np.array([12, 9, 17])
-    window = rng.random(tuple(end - begin)).astype(np.float32)
+    window = in_units(rng.normal(size=tuple(end - begin)))
     lattice.write(begin, end, value=window)
     whole = lattice.read("value", np.zeros(3, dtype=int), np.array(lattice.shape))
     inner = tuple(slice(b, e) for b, e in zip(begin, end, strict=True))
     np.testing.assert_array_equal(whole[inner], window)
-    whole[inner] = 1.0
-    assert (whole == 1.0).all()
+    whole[inner] = FAR / UNIT
+    assert (whole == FAR / UNIT).all()
     assert (lattice.read("block", begin, end) == -1).all()
     lattice.include(np.full(3, -3.0), np.zeros(3))  # the box grows downwards: the nodes stay where they are
     moved = lattice.read("value", begin - lattice.corner, end - lattice.corner)
     np.testing.assert_array_equal(moved, window)
+
+
+def test_distances_are_kept_to_an_eighth_of_a_millimetre_and_those_of_halls_cut_off():
+    distances = np.array([[[-9.0, -0.3, 0.0, 0.12345, 8.0, 20.0]]])
+    kept = UNIT * in_units(distances)[0, 0].astype(float)
+    assert np.abs(kept - distances[0, 0])[1:5].max() <= UNIT / 2
+    assert kept[[0, 5]] == pytest.approx([-8.19175, 8.19175])
 
 
 def test_a_snapshot_never_changes_while_the_map_goes_on():
@@ -65,10 +72,10 @@ def test_rows_that_no_snapshot_holds_are_used_again():
     rows = []
     held = Reader(lattice)
     for n in range(40):
-        fill(lattice, 0, 24, float(n))
+        fill(lattice, 0, 24, 0.2 * n)
         held = Reader(lattice)
         rows.append(len(lattice.nodes.arrays["value"]))
-    assert held.read().min() == 39
+    assert held.read().min() == round(7.8 / UNIT)
     assert rows[-1] == rows[2]
     assert lattice.nodes.used == 27
 
