@@ -27,7 +27,7 @@ INSIDE, OFF, UPRIGHT = 1.5, 1.5, 0.97
 ENOUGH, SHARE = 6, 0.1
 # The back is this much nearer [voxels] than where free space begins behind the first so large share of them: voxels are
 # known to be free from their middles, and those closest behind the board are averaged with views that ended on it.
-BEFORE, FIRST = 0.75, 0.1
+BEFORE, FIRST = 0.85, 0.1
 # No board is thinner than this [voxels].
 THINNEST = 0.25
 # Up to this depth [voxels] views end on the front itself.
