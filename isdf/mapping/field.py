@@ -127,7 +127,7 @@ def _query(points, origin, spacing, table, value, block, corrections, distance, 
     """Distances (n,) and gradients (n, 3) of points (n, 3), written in place."""
     nx, ny, nz = CHUNK * table.shape[0], CHUNK * table.shape[1], CHUNK * table.shape[2]
     per = np.float32(1 / spacing)
-    parts = np.float32(PARTS)
+    parts, apart = np.float32(PARTS), np.float32(spacing / PARTS)
     nodes, rows = np.empty((4, 4, 4), dtype=np.float32), np.empty((4, 4, 2), dtype=np.float32)
     lines = np.empty((4, 3), dtype=np.float32)
     one, two = np.empty((3, 3, 4), dtype=np.float32), np.empty((3, 4, 4), dtype=np.float32)
@@ -160,11 +160,11 @@ def _query(points, origin, spacing, table, value, block, corrections, distance, 
             e, ex, ey, ez = correction(corrections, m, a, b, c, tx, ty, tz)
             # Farther out than a step, values that bend up do not meet inside of a solid.
             crease = may_have_crease(corrections, m, a, b, c, 1) or (
-                parts * (d + e) < spacing and may_have_crease(corrections, m, a, b, c, -1)
+                d + e < apart and may_have_crease(corrections, m, a, b, c, -1)
             )
             if crease and 0 < i < nx - 2 and 0 < j < ny - 2 and 0 < k < nz - 2:
                 fine_nodes(table, value, block, corrections, (i, j, k), (a, b, c), one, two, owners, nodes)
-                d, gx, gy, gz = creased(nodes, tx, ty, tz, rows, lines)
+                d, gx, gy, gz = creased(nodes, tx, ty, tz, apart, rows, lines)
                 gx, gy, gz = parts * gx, parts * gy, parts * gz
             else:
                 d, gx, gy, gz = d + e, gx + parts * ex, gy + parts * ey, gz + parts * ez

@@ -17,6 +17,8 @@ BEND = 4
 # Solids thinner than this [m] may be missed between two nodes: lines that do not meet half as deep inside are raised by
 # so many times what is lacking. Meeting on a surface, they are above any chord then, which is half a fine step at most.
 THINNEST, LIFT = 0.005, 8
+# No distance changes faster than one moves: nodes that differ by so much more than they are apart are not followed.
+STEEPEST = 1.25
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -33,8 +35,8 @@ def trilinear(v000, v001, v010, v011, v100, v101, v110, v111, x, y, z):
 
 @njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def crease(a, b, c, d, t):
-    """Which line to follow at t in [0, 1] between b and c, of four distances in a row [m].
+def crease(a, b, c, d, t, apart):
+    """Which line to follow at t in [0, 1] between b and c, of four distances in a row, at nodes so far apart [m].
 
     Where the lines through the first two and through the last two both pass above the chord from b to c, they are the
     distances of two surfaces, and the lower of them holds: a ridge, f = max(chord, min(left, right)). Inside of solids
@@ -47,6 +49,8 @@ def crease(a, b, c, d, t):
         how much the line is raised [m].
     """
     one, zero = np.float32(1), np.float32(0)
+    if max(abs(b - a), abs(d - c)) > np.float32(STEEPEST) * apart:
+        return 1, t, zero
     chord, left, right = b + t * (c - b), b + t * (b - a), c - (one - t) * (d - c)
     if min(left, right) > chord:
         return (0, t + one, zero) if left < right else (2, t - one, zero)
@@ -61,7 +65,7 @@ def crease(a, b, c, d, t):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def creased(nodes, x, y, z, rows, lines):
+def creased(nodes, x, y, z, apart, rows, lines):
     """Interpolation of 4 x 4 x 4 nodes in the cell in their middle, with creases: along z, then y, then x.
 
     Args:
@@ -69,6 +73,7 @@ def creased(nodes, x, y, z, rows, lines):
         x: place in the middle cell, in [0, 1]; so are
         y: and
         z: this.
+        apart: distance between nodes [m].
         rows: (4, 4, 2) to work in, and
         lines: (4, 3), too.
 
@@ -78,16 +83,16 @@ def creased(nodes, x, y, z, rows, lines):
     for i in range(4):
         for j in range(4):
             v = nodes[i, j]
-            n, t, lift = crease(v[0], v[1], v[2], v[3], z)
+            n, t, lift = crease(v[0], v[1], v[2], v[3], z, apart)
             slope = v[n + 1] - v[n]
             rows[i, j, 0], rows[i, j, 1] = v[n] + t * slope + lift, slope
     for i in range(4):
         v = rows[i]
-        n, t, lift = crease(v[0, 0], v[1, 0], v[2, 0], v[3, 0], y)
+        n, t, lift = crease(v[0, 0], v[1, 0], v[2, 0], v[3, 0], y, apart)
         slope = v[n + 1, 0] - v[n, 0]
         lines[i, 0], lines[i, 1] = v[n, 0] + t * slope + lift, slope
         lines[i, 2] = v[n, 1] + t * (v[n + 1, 1] - v[n, 1])
-    n, t, lift = crease(lines[0, 0], lines[1, 0], lines[2, 0], lines[3, 0], x)
+    n, t, lift = crease(lines[0, 0], lines[1, 0], lines[2, 0], lines[3, 0], x, apart)
     a, b = lines[n], lines[n + 1]
     slope = b[0] - a[0]
     return a[0] + t * slope + lift, slope, a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2])

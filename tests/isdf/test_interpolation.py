@@ -31,9 +31,9 @@ def room_to_work_in():
     return np.empty((4, 4, 2), dtype=np.float32), np.empty((4, 3), dtype=np.float32)
 
 
-def at(values, place):
+def at(values, place, apart=1.0):
     x, y, z = (np.float32(p) for p in place)
-    return creased(values.astype(np.float32), x, y, z, *room_to_work_in())
+    return creased(values.astype(np.float32), x, y, z, np.float32(apart), *room_to_work_in())
 
 
 def two_planes(seed):
@@ -76,7 +76,7 @@ def test_a_board_between_the_nodes_is_met_exactly(seed):
     heights, values = 0.04 * (places - 0.5) @ normal, 0.04 * (GRID - 0.5) @ normal
     inside = 0
     for place, height in zip(places, heights, strict=True):
-        value, *gradient = at(np.abs(values) - 0.01, place)
+        value, *gradient = at(np.abs(values) - 0.01, place, apart=0.04)
         assert value == pytest.approx(abs(height) - 0.01, abs=1e-5)
         if abs(height) > 1e-4:
             assert gradient == pytest.approx(0.04 * np.sign(height) * normal, abs=1e-5)
@@ -89,7 +89,7 @@ def test_as_a_board_vanishes_the_field_rises_to_the_chord_without_a_jump():
     middle = []
     for depth in depths:
         row = [np.float32(step * abs(n - 0.5) + depth) for n in range(-1, 3)]
-        n, t, lift = crease(*row, np.float32(0.5))
+        n, t, lift = crease(*row, np.float32(0.5), np.float32(step))
         middle.append(row[n] + t * (row[n + 1] - row[n]) + lift)
     middle = np.array(middle)
     board = depths < -THINNEST / 2
@@ -109,6 +109,17 @@ def test_where_values_bend_up_outside_of_solids_it_is_trilinear(seed):
     values = two_planes(seed)[1].max(axis=-1) + FAR
     for place in two_planes(seed)[2]:
         assert at(values, place)[0] == pytest.approx(trilinear(values[1:3, 1:3, 1:3], place), abs=1e-5)
+
+
+@pytest.mark.parametrize("way", [1, -1], ids=["ridge", "valley"])
+def test_where_distances_jump_nothing_is_extended(way):
+    """As from what is known to be solid to what is not: a line through both would run far off."""
+    row = way * np.array([-2.0, 0.0, 0.0, -1.0])
+    values = np.broadcast_to(row, (4, 4, 4)) + way * FAR
+    assert at(values, (0.3, 0.6, 0.5))[0] == pytest.approx(way * FAR, abs=1e-5)
+    row[0] = -1.0 * way
+    values = np.broadcast_to(row, (4, 4, 4)) + way * FAR
+    assert at(values, (0.3, 0.6, 0.5))[0] == pytest.approx(way * (FAR + 0.5), abs=1e-5)
 
 
 @pytest.mark.parametrize("axis", range(3))
