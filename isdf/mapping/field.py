@@ -26,7 +26,8 @@ class LatticeField(AnalyticField):
 
     Interpolation is trilinear, but where fine nodes show a crease half way between two surfaces, in free space or in
     something thin: there the field follows both to where they meet (`isdf.mapping.interpolation`). Outside the lattice
-    the distance is that of the closest point on its rim, and the gradient across it is zero.
+    the distance is that of the closest point on its rim, and the gradient across it is zero. Distances beyond 8 m are
+    cut off.
 
     Args:
         table: (cx, cy, cz) row of every chunk of 8 x 8 x 8 coarse nodes, -1 where there is none.
@@ -73,7 +74,7 @@ class LatticeField(AnalyticField):
     def distance_and_gradient(
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Signed distance [m] and the exact gradient of the interpolant at world points [m]; no autograd graph."""
+        """Signed distance [m] and the gradient of the interpolant at world points [m]; no autograd graph."""
         check_points(points)
         flat = points.detach().cpu().numpy().reshape(-1, 3)
         distance, gradient = np.empty(len(flat), np.float32), np.empty((len(flat), 3), np.float32)

@@ -42,7 +42,8 @@ def crease(a, b, c, d, t, apart):
     distances of two surfaces, and the lower of them holds: a ridge, f = max(chord, min(left, right)). Inside of solids
     it is the other way round, a valley: f = min(chord, max(left, right)). So solids too thin to hold a node are found.
     Outside, values bend up beside the edges of things, but lines meet above zero there; those are raised until the
-    chord is lower. That is exact for two planes, and continuous (compare the subcell resolution of Harten, 1989).
+    chord is lower. That is exact for two planes (compare the subcell resolution of Harten, 1989), and continuous, but
+    where neighbours begin to differ by more than distances can: there the chord holds.
 
     Returns:
         which pair of neighbours the line goes through (0, 1 or 2), how far along from the first of them t is, and by
@@ -78,7 +79,7 @@ def creased(nodes, x, y, z, apart, rows, lines):
         lines: (4, 3), too.
 
     Returns:
-        value and its derivatives by x, y and z, those of the lines it follows.
+        value and its derivatives by x, y and z, those of the lines it follows; what raises a line counts as constant.
     """
     for i in range(4):
         for j in range(4):

@@ -27,7 +27,8 @@ FAR = 1.0
 CHUNK = 8
 # Most chunks that the box about the map may have room for, at four bytes each where nothing is.
 MAX_CHUNKS = 4_000_000
-# What is kept of a node: its type, and what holds where nothing was written. Snapshots read those published.
+# What is kept of a node: its type, and what holds where nothing was written; distances in units, see `in_units`.
+# Snapshots read those published.
 NODES: dict[str, tuple[Any, float]] = {
     "value": (np.int16, FAR / UNIT),
     "confidence": (np.uint8, 0.0),
