@@ -133,7 +133,15 @@ class Lattice:
         return out
 
     def write(self, begin: Int[np.ndarray, "3"], end: Int[np.ndarray, "3"], **values: np.ndarray) -> None:
-        """Set some kinds of values of the nodes of a window; no snapshot changes."""
+        """Set some kinds of values of the nodes of a window; no snapshot changes.
+
+        Raises:
+            TypeError: values are of a kind that does not fit, such as distances in metres instead of units.
+        """
+        kept = {
+            name: np.asarray(window).astype(NODES[name][0], order="C", casting="same_kind", copy=False)
+            for name, window in values.items()
+        }
         part = tuple(slice(b // CHUNK, -(-e // CHUNK)) for b, e in zip(begin, end, strict=True))
         table, nodes = self.table[part], self.nodes
         missing = table < 0
@@ -149,8 +157,7 @@ class Lattice:
                 array[copies] = array[rows]
             table[shared] = copies
             nodes.release(rows)
-        for name, window in values.items():
-            window = np.ascontiguousarray(window, NODES[name][0])
+        for name, window in kept.items():
             _copy(self.table, _bits(nodes.arrays[name]), begin, _bits(window), True)
 
     def reassign(

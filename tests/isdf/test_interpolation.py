@@ -176,7 +176,7 @@ def test_fine_nodes_are_those_of_the_cell_and_of_those_beside_it(orbit):
             assert out[index] == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize("corner", np.ndindex(2, 2, 2))
+@pytest.mark.parametrize("corner", list(np.ndindex(2, 2, 2)))
 def test_at_the_end_of_the_lattice_nothing_beyond_is_read(corner):
     """One refined cell in a corner of a lattice of one chunk: no row of corrections follows its own."""
     cell = tuple((CHUNK - 2) * c for c in corner)

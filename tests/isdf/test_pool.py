@@ -103,6 +103,13 @@ def test_blocks_of_corrections_are_not_written_while_read():
     assert lattice.cells.used == 0 and (block == -1).all()
 
 
+def test_distances_in_metres_are_not_cut_to_whole_units():
+    lattice = lattice_of(2.0)
+    with pytest.raises(TypeError, match=r"float64.*int16"):
+        lattice.write(np.zeros(3, dtype=int), np.full(3, 4), value=np.full((4, 4, 4), 0.7))
+    assert lattice.nodes.used == 0
+
+
 def test_memory_follows_what_was_written_and_not_the_box_about_it():
     lattice = lattice_of(2.0)
     fill(lattice, 0, 8, 2.0)
@@ -110,7 +117,7 @@ def test_memory_follows_what_was_written_and_not_the_box_about_it():
     lattice.include(np.zeros(3), np.array([60.0, 60.0, 3.0]))
     assert lattice.nbytes < before + 40_000
     end = (np.array(lattice.shape) // CHUNK - 1) * CHUNK
-    lattice.write(end, end + CHUNK, value=np.zeros((CHUNK,) * 3))
+    lattice.write(end, end + CHUNK, value=in_units(np.zeros((CHUNK,) * 3)))
     assert lattice.nodes.used == 2
     with pytest.raises(FrameError, match="chunks"):
         lattice.include(np.zeros(3), np.full(3, 900.0))
