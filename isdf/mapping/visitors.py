@@ -129,7 +129,10 @@ class Visitors:
         self._kept.last[rows] = now
         seen = np.isfinite(self._kept.first)
         past = looked_past(self._kept.place, seen, self.edge, depth, intrinsics, T_world_camera, axis)
-        self._kept.past[past] = now
+        # A column in which somebody is seen to stand is not empty, though a ray passes its middle: else his head would be
+        # given back before his feet, and nothing would tell any more that he was tall.
+        taken = np.broadcast_to(visited.any(axis=axis, keepdims=True), visited.shape)
+        self._kept.past[past & ~taken[tuple((self._kept.place - self._corner).T)]] = now
 
     def stand(
         self,

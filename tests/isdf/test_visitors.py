@@ -13,6 +13,7 @@ from isdf.mapping.bricks import BrickVolume
 from isdf.mapping.departed import looked_past
 from isdf.mapping.lately import Lately
 from isdf.mapping.lattice import Lattice
+from isdf.mapping.seeds import kept_seeds
 from isdf.mapping.visitors import Visitors
 from tests.isdf.rooms import box, furnished_room, look_at, render, union
 
@@ -226,6 +227,22 @@ def test_who_was_close_has_gone_when_the_camera_looks_past_him():
     assert past(near) == [False] * 4, "he may stand at the back of the brick"
     assert past(0 * far) == [False] * 4
     assert past(far, np.array([False, True, True, True])) == [False] * 4, "it was never seen to be tall"
+
+
+def test_who_goes_takes_his_feet_along_though_a_ray_passed_him_while_he_stood():
+    """What was seen of him reaches into a column of places whose middle is beside him."""
+    place, mapper = (EYE[0] + 0.6, EYE[1] + 0.6), Mapper(MapperConfig(visitors=2.0))
+    watch(mapper, THERE, 2.0)
+    watch(mapper, (*place, EYE[2]), 0.8, place, 1.7)
+    box = np.array([[*place, 0.8]]) + [[-0.6, -0.6, -1.3], [0.6, 0.6, 1.3]]
+
+    def strange():
+        seeds = kept_seeds(mapper.bricks, *mapper.bricks.box(*box))[:, :3].copy()
+        return int((furnished_room()(torch.from_numpy(seeds)).abs() > 0.05).sum())
+
+    assert strange() > 500
+    watch(mapper, (*THERE[:2], EYE[2]), 0.6)
+    assert strange() == 0
 
 
 def test_who_stood_close_is_taken_back_as_soon_as_the_camera_looks_past_him():
