@@ -354,7 +354,7 @@ def compile_kernels() -> None:
         frame = DepthFrame(depth, torch.eye(4), camera, time=float(2 * index))
         mapper.integrate(frame)
     anywhere, T = np.ones((12, 16), dtype=bool), frame.T_world_camera.numpy()
-    intrinsics, none = _intrinsics(frame), np.empty((0, 4), dtype=np.int64)
+    intrinsics, none = _intrinsics(frame), np.empty((0, 5), dtype=np.int64)
     mapper.clear_footprint(np.zeros((1, 3)), np.ones(1))
     mapper.visitors.watch(depth.numpy(), anywhere, 1, intrinsics, T, mapper.up, 1.0, frame.time)
     extend_down(

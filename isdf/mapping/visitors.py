@@ -83,7 +83,7 @@ class Visitors:
         self.edge = NODES * lattice.spacing
         self._offsets = np.argwhere(np.ones((BRICKS,) * 3, dtype=bool))
         self._kept = self._copied(np.empty((0, 3), dtype=np.int64), 0.0)
-        self._feet = np.empty((0, 4), dtype=np.int64)
+        self._feet = np.empty((0, 5), dtype=np.int64)
 
     def watch(
         self,
@@ -129,8 +129,8 @@ class Visitors:
         self._kept.last[rows] = now
         seen = np.isfinite(self._kept.first)
         past = looked_past(self._kept.place, seen, self.edge, depth, intrinsics, T_world_camera, axis)
-        # A column in which somebody is seen to stand is not empty, though a ray passes its middle: else his head would be
-        # given back before his feet, and nothing would tell any more that he was tall.
+        # A column in which somebody is seen to stand is not empty, though a ray passes its middle: else his head would
+        # be given back before his feet, and nothing would tell any more that he was tall.
         taken = np.broadcast_to(visited.any(axis=axis, keepdims=True), visited.shape)
         self._kept.past[past & ~taken[tuple((self._kept.place - self._corner).T)]] = now
 

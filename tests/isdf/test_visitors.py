@@ -14,6 +14,7 @@ from isdf.mapping.departed import looked_past
 from isdf.mapping.lately import Lately
 from isdf.mapping.lattice import Lattice
 from isdf.mapping.seeds import kept_seeds
+from isdf.mapping.standing import columns, feet, parts
 from isdf.mapping.visitors import Visitors
 from tests.isdf.rooms import box, furnished_room, look_at, render, union
 
@@ -130,7 +131,7 @@ def test_who_is_seen_from_the_waist_up_stands_on_the_floor():
         watch(mapper, (*place, EYE[2] + 0.1), 1.0, place)
         mapper.refresh()
         errors.append(float(mapper.field().distance(legs).abs().mean()))
-    assert errors[0] > 0.05 and errors[1] < 0.6 * errors[0], errors
+    assert errors[0] > 0.05 and errors[1] < 0.4 * errors[0], errors
 
 
 def test_what_is_seen_to_stay_is_kept():
@@ -229,12 +230,27 @@ def test_who_was_close_has_gone_when_the_camera_looks_past_him():
     assert past(far, np.array([False, True, True, True])) == [False] * 4, "it was never seen to be tall"
 
 
+@pytest.mark.parametrize("way", [1, -1])
+def test_he_stands_by_what_is_seen_of_him_in_the_two_lowest_places(way):
+    pixels = np.zeros((3, 1, 7), dtype=np.int32)
+    pixels[0, 0, 3:6], pixels[1, 0, 3] = 60, 60
+    pixels[2, 0, 4], pixels[2, 0, 6] = 60, 60  # between both it is somebody else, or nobody
+    expected = [[0, 0, 4, 4, 1], [1, 0, 3, 3, 0], [2, 0, 4, 4, 0]]
+    if way < 0:
+        pixels, expected = pixels[:, :, ::-1], [[x, y, 6 - z, *rest] for x, y, z, *rest in expected]
+    found = feet(pixels, np.ones_like(pixels, dtype=bool), 2, way, 0 if way > 0 else 6)
+    assert found.tolist() == expected
+    highest = parts(found, 2, 2, way)
+    assert highest[0].tolist() == [0, 0, 9 if way > 0 else 4, 9, 2] and highest[4].tolist()[3:] == [7, 0]
+    assert len(columns(found, 2, way)) == 5 + 4 + 5
+
+
 def test_who_goes_takes_his_feet_along_though_a_ray_passed_him_while_he_stood():
     """What was seen of him reaches into a column of places whose middle is beside him."""
     place, mapper = (EYE[0] + 0.6, EYE[1] + 0.6), Mapper(MapperConfig(visitors=2.0))
     watch(mapper, THERE, 2.0)
     watch(mapper, (*place, EYE[2]), 0.8, place, 1.7)
-    box = np.array([[*place, 0.8]]) + [[-0.6, -0.6, -1.3], [0.6, 0.6, 1.3]]
+    box = np.array([*place, 0.8]) + np.array([[-0.6, -0.6, -1.3], [0.6, 0.6, 1.3]])
 
     def strange():
         seeds = kept_seeds(mapper.bricks, *mapper.bricks.box(*box))[:, :3].copy()
@@ -258,4 +274,4 @@ def test_who_stood_close_is_taken_back_as_soon_as_the_camera_looks_past_him():
         watch(mapper, (*away[:2], EYE[2]), seconds, still, 1.7)
         mapper.refresh()
         changed.append(float((mapper.field().distance(points) - before).abs().mean()))
-    assert changed[0] < 0.025 and changed[1] > 0.05, changed
+    assert changed[0] < 0.015 and changed[1] > 0.05, changed
