@@ -11,8 +11,9 @@ from benchmarks.random_rooms import RandomRoom
 from planning.path_reference import wrapped
 from robots.simulation.poses import looking
 
-# How often each kind of way is taken: driving about, driving past pieces of furniture, going up to one, by hand.
-KINDS = {"drive": 0.3, "visit": 0.25, "reach": 0.3, "hand": 0.15}
+# How often each kind of way is taken: driving about, driving past pieces of furniture, going up to one, by hand,
+# turning round at one place.
+KINDS = {"drive": 0.25, "visit": 0.2, "reach": 0.25, "hand": 0.1, "turn": 0.2}
 # A way of fewer images is given up for another, so many times.
 FEWEST, ATTEMPTS = 12, 6
 # Time between two images [s]: several of a camera's, for a mapper hardly learns from those between.
@@ -44,6 +45,8 @@ def _poses(rng: np.random.Generator, room: RandomRoom, kind: str) -> list[np.nda
     start = _free_place(rng, room)
     if start is None:
         return []
+    if kind == "turn":
+        return list(_round(rng, room, start))
     robot = _Robot(room, start, float(rng.uniform(-np.pi, np.pi)), float(rng.normal(1.2, 0.15)))
     {"drive": _drive, "visit": _visit, "reach": _reach}[kind](rng, robot)
     return robot.poses
@@ -178,6 +181,17 @@ def _by_hand(rng: np.random.Generator, room: RandomRoom) -> Iterator[np.ndarray]
             eye, at = eye + rng.normal(0, 0.1, 3), target + rng.normal(0, 0.45, 3) * np.array([1, 1, 0.4])
         if room.inside(eye[None])[0] and room.distance(eye[None])[0] > 0.1:
             yield looking(eye, at - eye)
+
+
+def _round(rng: np.random.Generator, room: RandomRoom, place: np.ndarray) -> Iterator[np.ndarray]:
+    """Turning about a place (2,) [m], held a little out of the axis: as one looks round where one begins."""
+    angle, sweep, count = rng.uniform(0, 2 * np.pi), rng.uniform(1.5, 7), int(rng.integers(FEWEST, 40))
+    arm, height, rise = rng.uniform(0, 0.4), rng.uniform(0.5, 1.6), -rng.uniform(-0.1, 0.7)
+    for a in angle + sweep * np.arange(count) / count:
+        ahead = np.array([np.cos(a), np.sin(a)])
+        eye = np.append(place + arm * ahead, room.floor + height)
+        if room.inside(eye[None])[0] and room.distance(eye[None])[0] > 0.1:
+            yield looking(eye, [*ahead, rise])
 
 
 def _free_place(

@@ -35,7 +35,10 @@ from isdf.mapping.values import LEAST_OF_ERROR
 from robots.simulation import DepthNoise, DepthNoiseConfig
 
 SPACING = 0.16
-IMAGE = (160, 120)
+# Widths of images [px], and how often each is taken.
+WIDTHS = {160: 0.7, 80: 0.3}
+# Share of cameras that measure without any error, as those of many simulators do.
+WITHOUT_NOISE = 0.2
 UP = np.array([0.0, 0.0, 1.0])
 # Windows of one way, at most.
 MOMENTS = 5
@@ -169,7 +172,8 @@ def turned(window: Window, rng: np.random.Generator) -> Window:
             x, planes = x.flip(axis + 1), [p.flip(axis) for p in planes]
             x[4 + axis] = -x[4 + axis]
     if rng.random() < 0.5:
-        x, planes = x.transpose(1, 2)[[0, 1, 2, 3, 5, 4, 6, 7]], [p.transpose(0, 1) for p in planes]
+        x, planes = x.transpose(1, 2).clone(), [p.transpose(0, 1) for p in planes]
+        x[4:6] = x[4:6].flip(0)
     return Window(x, *planes)
 
 
@@ -301,9 +305,12 @@ def windows(rng: np.random.Generator) -> Iterator[tuple[str, Window]]:
     kind, poses = camera_way(rng, room)
     if len(poses) < 4:
         return
-    camera = PinholeCamera.from_fov(*IMAGE, float(np.radians(rng.choice([58, rng.uniform(50, 88)]))))
+    width = int(rng.choice(list(WIDTHS), p=list(WIDTHS.values())))
+    angle = float(np.radians(rng.choice([58, rng.uniform(50, 88)])))
+    camera = PinholeCamera.from_fov(width, width * 3 // 4, angle)
     far = float(rng.choice([4.0, 6.0, 10.0, 10.0]))
     noise = DepthNoise(DepthNoiseConfig(distortion_seed=int(rng.integers(1000)), max_range=far))
+    noisy = rng.random() >= WITHOUT_NOISE
     mapper, drawn = Fusing(), []
     moments = {int(rng.integers(1, 6)), len(poses)} | {
         int(n) for n in rng.integers(3, len(poses) + 1, MOMENTS - 2)
@@ -311,7 +318,7 @@ def windows(rng: np.random.Generator) -> Iterator[tuple[str, Window]]:
     for count, T in enumerate(poses, start=1):
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         depth = depth_image(*room.solids, T, intrinsics, camera.height, camera.width, 0.1, far)
-        measured = torch.from_numpy(noise(depth, rng))
+        measured = torch.from_numpy(noise(depth, rng) if noisy else depth)
         if not measured.any():
             continue
         mapper.integrate(DepthFrame(measured, torch.from_numpy(T), camera, time=PERIOD * count))

@@ -38,11 +38,31 @@ def test_truth_of_a_window_lies_between_its_bounds():
     assert (truth < lower - 0.08).float().mean() < 0.02
 
 
+def test_a_camera_that_turns_looks_round_at_one_place():
+    found = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        room = random_room(rng)
+        kind, poses = camera_way(rng, room)
+        if kind != "turn":
+            continue
+        found += 1
+        eyes, ahead = np.array(poses)[:, :3, 3], np.array(poses)[:, :2, 2]
+        heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+        assert np.ptp(eyes[:, 2]) < 1e-9 and np.linalg.norm(np.ptp(eyes, axis=0)) < 1.2
+        assert (np.diff(heading) > 0).all() and np.ptp(heading) > 1.2
+        assert (room.distance(eyes) > 0.1).all() and room.inside(eyes).all()
+    assert found > 2
+
+
 def test_turning_a_window_turns_its_directions():
     _, window = next(windows(np.random.default_rng(3)))
     for seed in range(8):
         other = turned(window, np.random.default_rng(seed))
         # Against the direction to the closest surface the distance to it grows.
+        torch.testing.assert_close(
+            other.x[6:].sum((1, 2, 3)), window.x[6:].sum((1, 2, 3)), atol=0.1, rtol=1e-3
+        )
         for axis in range(2):
             slope = other.x[0].diff(dim=axis).narrow(1 - axis, 0, 8)
             along = other.x[4 + axis].narrow(axis, 0, slope.shape[axis]).narrow(1 - axis, 0, 8)
