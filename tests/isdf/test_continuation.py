@@ -63,3 +63,24 @@ def test_nothing_is_said_where_nothing_is_left_to_guess():
     assert (continued(seeds, nearest, upper, upper - 0.05, free) == 0).all()
     assert (continued(seeds, nearest, upper + 30, upper, free) == 0).all()
     assert (continued(seeds, nearest, upper, upper - 0.5, free)[0, ..., 2] == 2).all()
+
+
+def test_a_leaning_plane_is_measured_along_its_own_normal():
+    normal = np.array([2.0, -1.0, 2.0]) / 3
+    along = np.array([1.0, 2.0, 0.0]) / np.sqrt(5)
+    seeds = np.array([[6, 6, 6, *normal]], dtype=np.float32)
+    offsets = np.indices((13, 13, 13)).reshape(3, -1).T - 6
+    upper = np.linalg.norm(offsets, axis=1).reshape(13, 13, 13).astype(np.float32)
+    free = (offsets @ normal > 0).reshape(upper.shape)
+    free |= (offsets @ along > 3).reshape(upper.shape)
+    out = continued(seeds, np.zeros(upper.shape, dtype=np.int32), upper, 0 * upper, free)
+    asked = (upper > 1).ravel()
+    off = offsets @ normal
+    foot = offsets - off[:, None] * normal
+    planes = out.reshape(len(out), -1)
+    np.testing.assert_allclose(planes[0, asked], off[asked], atol=1e-5)
+    np.testing.assert_allclose(planes[1, asked], np.linalg.norm(foot, axis=1)[asked], atol=1e-4)
+    within = asked & (np.abs(foot).max(axis=1) < 5)
+    past, short = within & (foot @ along > 4), within & (foot @ along < 1)
+    assert past.sum() > 20 and planes[5, past].min() > 0.9
+    assert short.sum() > 20 and planes[5, short].max() < 0.6 and np.mean(planes[5, short]) < 0.2
