@@ -13,7 +13,7 @@ from robots.simulation.poses import looking
 
 # How often each kind of way is taken: driving about, driving past pieces of furniture, going up to one, by hand,
 # turning round at one place.
-KINDS = {"drive": 0.25, "visit": 0.2, "reach": 0.25, "hand": 0.1, "turn": 0.2}
+KINDS = {"drive": 0.2, "visit": 0.35, "reach": 0.2, "hand": 0.1, "turn": 0.15}
 # A way of fewer images is given up for another, so many times.
 FEWEST, ATTEMPTS = 12, 6
 # Time between two images [s]: several of a camera's, for a mapper hardly learns from those between.

@@ -10,11 +10,13 @@ from numba import njit
 
 from robots.simulation import furniture as fn
 from robots.simulation.poses import planar_pose
-from robots.simulation.primitives import Box, Primitive
+from robots.simulation.primitives import Box, Cylinder, Primitive
 
 KINDS = {"box": 0, "cylinder": 1, "sphere": 2}
 CEILINGS = 0.9
 """Share of rooms with a ceiling: few cameras ever see one, but real rooms have it, at much the same height."""
+SMALL = 0.5
+"""Greatest width of stools, bins and the like [m]."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ def place(
             solids += fn.placed(parts, x, y, yaw)
             pieces.append(np.array([x, y, 0.7 * top]))
             solids += clutter(rng, name, x, y, yaw, width, depth, top)
-            if any(part.name.endswith(".top") for part in parts) and rng.random() < 0.5:
+            if width > SMALL and any(part.name.endswith(".top") for part in parts) and rng.random() < 0.5:
                 solids += chairs(rng, name, x, y, yaw, width, depth)
             return
 
@@ -149,7 +151,7 @@ def clutter(rng, name, x, y, yaw, width, depth, top) -> list[Primitive]:
         return []
     things: list[Primitive] = []
     for number in range(int(rng.integers(1, 4))):
-        extent = rng.uniform(0.05, 0.35, 3)
+        extent = rng.uniform(0.05, min(0.35, width, depth), 3)
         a, b = rng.uniform(-0.35, 0.35) * width, rng.uniform(-0.35, 0.35) * depth
         pose = planar_pose(a, b, top + extent[2] / 2, yaw=rng.uniform(0, 3))
         things.append(Box(f"{name}.thing{number}", pose, tuple(extent)))
@@ -161,7 +163,7 @@ def piece(rng: np.random.Generator, name: str) -> tuple[fn.Parts, float, float, 
     w, u = float(rng.uniform(0.6, 2.2)), float(rng.uniform(0.35, 1.0))
     h = float(rng.uniform(0.35, 1.1))
     tall = float(rng.uniform(0.8, 2.2))
-    kind = int(rng.integers(13))
+    kind = int(rng.integers(16))
     if kind <= 2:
         return fn.table(name, w, u, h, thickness=float(rng.uniform(0.02, 0.08))), w, u, h
     if kind == 3:
@@ -182,8 +184,24 @@ def piece(rng: np.random.Generator, name: str) -> tuple[fn.Parts, float, float, 
         return (fn.plant(name), 0.5, 0.5, 1.2) if rng.random() < 0.5 else (fn.floor_lamp(name), 0.3, 0.3, 1.6)
     if kind == 11:
         return fn.bed(name), 1.4, 2.1, 0.5
+    if kind >= 13:
+        return small_piece(rng, name)
     box = Box(name, planar_pose(0, 0, tall / 2), (w, u, tall))
     return (box,), w, u, tall
+
+
+def small_piece(rng: np.random.Generator, name: str) -> tuple[fn.Parts, float, float, float]:
+    """A stool or side table on legs or a column, or a bin or box, with its width, depth and height [m]."""
+    w, u, h = float(rng.uniform(0.2, SMALL)), float(rng.uniform(0.2, SMALL)), float(rng.uniform(0.25, 0.85))
+    kind = int(rng.integers(4))
+    if kind == 0:
+        return fn.table(name, w, u, h, thickness=float(rng.uniform(0.02, 0.1))), w, u, h
+    if kind == 1:
+        return fn.round_table(name, w / 2, h), w, w, h
+    whole: Primitive = Box(name, planar_pose(0, 0, h / 2), (w, u, h))
+    if kind == 2:
+        whole = Cylinder(name, planar_pose(0, 0, h / 2), w / 2, h)
+    return (whole,), w, u, h
 
 
 @njit(cache=True, nogil=True)
