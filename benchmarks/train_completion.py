@@ -50,8 +50,6 @@ LOOKS_COUNT = 4.0
 GRADIENT_COUNTS = 0.075
 # Truth is asked for this far into walls and floor [m]; beyond them there is nothing to know.
 INTO_WALLS = 0.3
-# How much an error counts that makes a place look farther from surfaces than it is, the unsafe side, of 2 for both.
-UNSAFE_COUNTS = 1.2
 # Nothing is expected to err by less than this [m].
 LEAST_EXPECTED = 0.01
 # The learning rate rises for so many steps.
@@ -199,19 +197,18 @@ def predicted(net: CompletionNet, window: Window) -> tuple[torch.Tensor, torch.T
 def score(net: CompletionNet, window: Window) -> tuple[torch.Tensor, float]:
     """Loss and mean error [m] where there is something to guess.
 
-    The loss is the likelihood of a Laplace distribution with a safe side: its location learns a little less than the
-    median, its width the error. To it comes how far the gradient is turned away from the true one.
+    The loss is the likelihood of a Laplace distribution: its location learns the median, its width the error. To it
+    comes how far the gradient is turned away from the true one.
     """
     f, width, gap = predicted(net, window)
     here = window.mask & (gap > LEAST_GAP)
-    off = (f - window.truth)[here]
-    error = torch.where(off > 0, UNSAFE_COUNTS * off, (UNSAFE_COUNTS - 2) * off)
+    error = (f - window.truth).abs()[here]
     expected = gap[here] * width[here].exp() + LEAST_EXPECTED
     away, known = turned_away(f, window)
     known &= here
     loss = (counts(window, here) * (4 * error + 0.1 * (error / expected + expected.log()))).sum()
     loss += 4 * GRADIENT_COUNTS * (counts(window, known) * away[known]).sum()
-    return loss, float(off.detach().abs().mean()) if len(off) else 0.0
+    return loss, float(error.detach().mean()) if len(error) else 0.0
 
 
 def counts(window: Window, here: torch.Tensor) -> torch.Tensor:
