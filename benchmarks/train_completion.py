@@ -278,7 +278,7 @@ class Window:
     """What the network would see at one moment, and what would be right.
 
     Args:
-        x: features (15, nx, ny, nz).
+        x: features (8, nx, ny, nz).
         truth: distances (nx, ny, nz) [m].
         mask: where they are known.
         looks: how often a point of the views so far, drawn as maps are judged by them, is closest to a node.

@@ -225,7 +225,7 @@ def draw_map(out: Path) -> None:
     field, lattice, bricks = mapper.field(), mapper.lattice, mapper.bricks
     shape = np.array(lattice.shape)
     upper_corner = lattice.spacing * (lattice.corner + shape)
-    seeds = surface_seeds(bricks.arrays, *bricks.box(lattice.spacing * lattice.corner, upper_corner))[:, :6]
+    seeds = surface_seeds(bricks.arrays, *bricks.box(lattice.spacing * lattice.corner, upper_corner))[:, :3]
     evidence = lattice.read("evidence", np.zeros_like(shape), shape)
     proven = gather(seeds, evidence, lattice.corner, lattice.spacing)
     nodes = np.rint(points.numpy() / lattice.spacing).astype(int) - lattice.corner

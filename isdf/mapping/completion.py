@@ -14,20 +14,17 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from .continuation import PLANES
 from .evidence import Evidence
 
-CHANNELS = 8 + PLANES
+CHANNELS = 8
 # A window's sides must be multiples of this many nodes: the network halves them three times.
 STRIDE = 8
 REACH = 3.0
 WEIGHTS = Path(__file__).parent.parent / "data" / "completion.safetensors"
 
 
-def features(evidence: Evidence) -> Float[Tensor, "15 nx ny nz"]:
-    """What the network sees of each node: bounds, state, direction to the closest surface, height, and that surface
-    continued.
-    """
+def features(evidence: Evidence) -> Float[Tensor, "8 nx ny nz"]:
+    """What the network sees of each node: bounds, state, direction to the closest surface, height."""
     shape = evidence.upper.shape
     planes = [
         np.minimum(evidence.upper, REACH),
@@ -36,7 +33,6 @@ def features(evidence: Evidence) -> Float[Tensor, "15 nx ny nz"]:
         evidence.unknown,
         *np.moveaxis(evidence.direction, -1, 0),
         np.broadcast_to(np.clip(evidence.height, -2, 4), shape),
-        *evidence.continued,
     ]
     return torch.from_numpy(np.stack([p.astype(np.float32) for p in planes]))
 
@@ -62,7 +58,7 @@ class CompletionNet(nn.Module):
         )
 
     def forward(
-        self, x: Float[Tensor, "b 15 nx ny nz"]
+        self, x: Float[Tensor, "b 8 nx ny nz"]
     ) -> tuple[Float[Tensor, "b nx ny nz"], Float[Tensor, "b nx ny nz"]]:
         """Share in (0, 1) and logarithm of the expected error over the gap."""
         one = self.down1(x)

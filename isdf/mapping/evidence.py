@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 
-from .continuation import continued
 from .nearest import nearest_points
 
 # A node closer than this to a seen surface, and not seen to be free, is part of that surface [nodes].
@@ -102,16 +101,14 @@ class Evidence(Bounds):
     Args:
         direction: unit vector to the closest surface point.
         height: above the lowest surfaces seen [m].
-        continued: what the plane of the closest surface says, see `continuation.continued`; its distances in metres.
     """
 
     direction: Float[np.ndarray, "nx ny nz 3"]
     height: Float[np.ndarray, "nz"]
-    continued: Float[np.ndarray, "7 nx ny nz"]
 
 
 def gather(
-    seeds: Float[np.ndarray, "n 6"],
+    seeds: Float[np.ndarray, "n 3"],
     evidence: UInt8[np.ndarray, "nx ny nz"],
     corner: np.ndarray,
     spacing: float,
@@ -119,28 +116,19 @@ def gather(
     """Bounds from surface points [m] and free evidence, and where the closest of the points lie.
 
     Args:
-        seeds: (n, 6) float32 surface points in world coordinates [m] and their unit normals; at least one.
+        seeds: (n, 3) float32 surface points in world coordinates [m]; at least one.
         evidence: of the nodes of the window.
         corner: lattice index of its first node.
         spacing: of the nodes [m].
     """
     shape = evidence.shape
-    proven = bounds(seeds[:, :3], evidence, corner, spacing)
-    places = _in_nodes(seeds[:, :3], corner, spacing)
+    proven = bounds(seeds, evidence, corner, spacing)
     nodes = np.stack(np.meshgrid(*[np.arange(n, dtype=np.float32) for n in shape], indexing="ij"), axis=-1)
     reach = np.maximum(proven.upper / np.float32(spacing), 1e-3)
-    direction = (places[proven.nearest] - nodes) / reach[..., None]
+    direction = (_in_nodes(seeds, corner, spacing)[proven.nearest] - nodes) / reach[..., None]
     floor = np.partition(seeds[:, 2], len(seeds) // 50)[len(seeds) // 50]
     height = (spacing * (corner[2] + np.arange(shape[2])) - floor).astype(np.float32)
-    planes = continued(
-        np.concatenate([places, seeds[:, 3:6]], axis=1),
-        proven.nearest,
-        proven.upper / np.float32(spacing),
-        proven.lower / np.float32(spacing),
-        proven.free,
-    )
-    planes[:2] *= np.float32(spacing)
-    return Evidence(**vars(proven), direction=direction, height=height, continued=planes)
+    return Evidence(**vars(proven), direction=direction, height=height)
 
 
 def bounds(
@@ -149,7 +137,7 @@ def bounds(
     corner: np.ndarray,
     spacing: float,
 ) -> Bounds:
-    """The bounds alone; arguments as for `gather`, but seeds (n, 3) without normals."""
+    """The bounds alone; arguments as for `gather`."""
     everywhere = np.ones(evidence.shape, dtype=np.bool_)
     nearest, square = nearest_points(_in_nodes(seeds, corner, spacing), everywhere)
     upper = np.sqrt(square)

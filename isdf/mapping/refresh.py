@@ -95,17 +95,17 @@ def surroundings(
     spare = (end - begin) % STRIDE
     below = np.where((np.arange(3) == axis) & upside_down, spare, 0)
     begin, end = begin + below, end - (spare - below)
-    seeds = kept_seeds(bricks, *bricks.box(middle - reach - MARGIN, middle + reach + MARGIN))[:, :6]
+    seeds = kept_seeds(bricks, *bricks.box(middle - reach - MARGIN, middle + reach + MARGIN))[:, :3]
     if len(seeds) == 0 or (end <= begin).any():
         return None
     order = [across for across in range(3) if across != axis] + [axis]
     evidence, corner, seeds = (
         lattice.read("evidence", begin, end).transpose(order),
         (lattice.corner + begin)[order],
-        seeds[:, order + [3 + across for across in order]],
+        seeds[:, order],
     )
     if upside_down:
-        evidence, seeds = evidence[:, :, ::-1], seeds * np.array([1, 1, -1, 1, 1, -1], dtype=np.float32)
+        evidence, seeds = evidence[:, :, ::-1], seeds * np.array([1, 1, -1], dtype=np.float32)
         corner[2] = -(corner[2] + evidence.shape[2] - 1)
     proven = gather(np.ascontiguousarray(seeds), np.ascontiguousarray(evidence), corner, lattice.spacing)
     return Surroundings(proven, corner, begin, end, order, upside_down)

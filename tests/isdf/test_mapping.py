@@ -160,7 +160,7 @@ def test_of_frames_that_come_seldom_none_goes_without_the_network(monkeypatch):
 
 def test_truth_lies_between_the_bounds(orbit):
     lattice, bricks = orbit.lattice, orbit.bricks
-    seeds = surface_seeds(bricks.arrays, *bricks.box(np.full(3, -9.0), np.full(3, 9.0)))[:, :6]
+    seeds = surface_seeds(bricks.arrays, *bricks.box(np.full(3, -9.0), np.full(3, 9.0)))[:, :3]
     evidence = lattice.read("evidence", np.zeros(3, dtype=int), np.array(lattice.shape))
     proven = gather(seeds, evidence, lattice.corner, lattice.spacing)
     nodes = lattice.spacing * (lattice.corner + np.argwhere(np.ones(lattice.shape, dtype=bool)))
